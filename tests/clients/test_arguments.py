@@ -11,12 +11,13 @@ import pytest
 from faulty.service import MAP, Service, endpoint_in
 
 from factorbus.client import Bus, Changes, Draft, Map, Unavailable, aio, connect
+from factorbus.client.changes import some_of
 from factorbus.client.draft import batch_of
 from factorbus.client.merging import fit_into
 from factorbus.client.uncertainty import factors_of, paired, sightings, why_question
 from factorbus.proto.asking import Covariances
-from factorbus.proto.messages import Batch, Estimate, MapGraph
-from factorbus.proto.problems import BadLoss, BadOption, ClosedHere, Problem
+from factorbus.proto.messages import Accepted, Batch, Estimate, MapGraph
+from factorbus.proto.problems import BadLoss, BadOption, BadShape, ClosedHere, Problem
 from factorbus.proto.symbols import symbol
 
 pytestmark = pytest.mark.timeout(60)
@@ -135,6 +136,25 @@ def test_a_loss_that_does_not_exist_is_said_in_a_sentence() -> None:
     assert group.loss == ""
 
 
+@pytest.mark.parametrize(
+    "put_together",
+    [
+        lambda c: c.fix(),
+        lambda c: c.free([]),
+        lambda c: c.remove_variables(),
+        lambda c: c.marginalize(),
+        lambda c: c.remove_factors([]),
+        lambda c: c.loss([], "dcs"),
+        lambda c: c.weigh([], 0.5),
+        some_of,
+    ],
+)
+def test_a_change_of_nothing_is_refused(put_together: Callable[[Changes], object]) -> None:
+    with pytest.raises(BadShape, match=r"changes: .*(no key|no id of a factor|none)"):
+        put_together(Changes())
+    assert Changes().undo(Batch(), Accepted(1, 1, 1, 0, True)).listed() == ()
+
+
 def test_true_and_false_of_numpy_will_do() -> None:
     (group,) = Draft().se2("x0", (0, 0, 0), fixed=cast("Any", np.bool_(True))).batch().variables
     assert group.fixed is True
@@ -174,7 +194,7 @@ def test_times_of_every_call(bus: Bus, kitchen: Map, timeout_s: Any) -> None:
     pending_insert = kitchen.send(POINT)
     calls: list[Callable[..., object]] = [
         lambda **t: kitchen.insert(Draft(), **t), lambda **t: kitchen.send(Draft(), **t), kitchen.settle,
-        lambda **t: kitchen.change(Changes(), **t), kitchen.flush, kitchen.wait_converged, kitchen.stats,
+        lambda **t: kitchen.change(Changes().fix("x0"), **t), kitchen.flush, kitchen.wait_converged, kitchen.stats,
         kitchen.chi2, kitchen.graph, kitchen.clients, kitchen.export, kitchen.ask_estimate, kitchen.repair,
         kitchen.estimate.wait_converged, lambda **t: kitchen.estimate.wait_for(1, **t), pending_insert.result,
         kitchen.uncertainty.covariance, lambda **t: kitchen.uncertainty.why("x1", **t), bus.maps, bus.stats,

@@ -15,7 +15,7 @@ from processes import Process
 from turned import closing, in_one
 
 from factorbus.cli.main import main
-from factorbus.cli.output.exits import OK, USAGE
+from factorbus.cli.output.exits import OK, UNAVAILABLE, USAGE
 from factorbus.client import Draft, connect
 from factorbus.proto.messages import Delta, Variables
 from factorbus.proto.stamps import NO_STAMP
@@ -138,9 +138,27 @@ def test_problems_have_their_codes(endpoint: str, gateway: str) -> None:
     assert refusal(f"{root}/nowhere/estimate") == (404, "unknown_map")
     assert refusal(f"{root}/not%20a%20name/estimate")[1] in ("bad_name", "unknown_map")
     assert refusal(f"{root}/small/variables/x9") == (404, "unknown_variable")
+    for address in (f"{root}/small", f"{root}/small/nothing", f"{gateway}/api/nothing"):
+        assert refusal(address) == (404, "unknown_question")
+    with pytest.raises(urllib.error.HTTPError) as missing:
+        get(f"{root}/small/variables/x9")
+    with missing.value as answer:
+        detail = json.load(answer)["problem"]["detail"]
+    assert (detail["key"], detail["keys"]) == ("x9", ["x9"]), "as text, which JavaScript does not round"
+    assert refusal(f"{gateway}/nothing")[1] == "Not Found"
     assert refusal(f"{root}/small/variables/12x") == (400, "bad_symbol")
     assert refusal(f"{root}/small/export?format=png") == (400, "bad_option")
     assert refusal(f"{root}/small/estimate", Host="evil.example")[0] == 400
+
+
+@pytest.mark.parametrize("command", [["gateway"], ["watch", "town", "--serve"]])
+def test_other_machines_are_served_only_if_one_says_so(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    for host in ("0.0.0.0", "::", "192.168.1.20", "robot.local"):
+        assert main([*command, "--connect", "tcp/127.0.0.1:1", "--host", host]) == USAGE
+        assert "[exposed]" in capsys.readouterr().err
+        assert main([*command, "--connect", "tcp/127.0.0.1:1", "--host", host, "--insecure"]) == UNAVAILABLE
+    for host in ("127.0.0.1", "127.0.0.5", "localhost", "::1"):
+        assert main([*command, "--connect", "tcp/127.0.0.1:1", "--host", host]) == UNAVAILABLE
 
 
 def test_a_page_from_elsewhere_gets_no_map(endpoint: str, gateway: str) -> None:

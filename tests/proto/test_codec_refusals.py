@@ -75,15 +75,16 @@ def test_what_is_wrong_is_named_by_its_place(content: dict[str, Any], text: str)
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        (b"", "not readable"),
+        (b"", r"not readable \(it ends too early\)"),
         (b"\xc1", r"not readable \(a byte 0xc1"),
-        (b"\x93\x01", "not readable"),
+        (b"\x93\x01", r"not readable \(it ends too early\)"),
         (msgpack.packb([1]), "insert: is an array; wanted a map"),
-        (msgpack.packb({"sequence": 1}) + b"\x00", "not readable"),
-        (b"\x81\x01\x02", "not readable"),
-        (b"\x81\xa1x\xc6\xff\xff\xff\xff", "not readable"),
-        (b"\x81\xa1x\xa1\xff", "not readable"),
-        (b"\x81\xa1x\xc7\x03\xff\x00\x00\x00", "not readable"),
+        (msgpack.packb({"sequence": 1}) + b"\x00", r"not readable \(bytes follow the map\)"),
+        (b"\x81\x01\x02", r"not readable \(a key of a map that is no string\)"),
+        (b"\x81\x90\x01", r"not readable \(a key of a map that is no string\)"),
+        (b"\x81\xa1x\xc6\xff\xff\xff\xff", r"not readable \(it ends too early\)"),
+        (b"\x81\xa1x\xa1\xff", r"not readable \(a string that is not UTF-8\)"),
+        (b"\x81\xa1x\xc7\x03\xff\x00\x00\x00", r"not readable \(a time stamp that is none\)"),
     ],
 )
 def test_bytes_that_are_no_map_are_refused(data: bytes, text: str) -> None:
@@ -104,6 +105,7 @@ def test_too_many_levels_groups_or_elements_are_too_large(data: bytes, size: int
     with pytest.raises(TooLarge) as caught:
         codec.decode_insert(data)
     assert (caught.value.detail["size"], caught.value.detail["limit"]) == (size, limit)
+    assert caught.value.message.endswith("; send it flatter") == ("nesting" in caught.value.message)
 
 
 def test_a_kind_that_is_not_known_is_refused_in_an_insert() -> None:

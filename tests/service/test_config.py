@@ -1,6 +1,8 @@
 """Settings from a file: what is there is used, what is misspelt is said."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -58,3 +60,10 @@ def test_what_cannot_be_is_named(tmp_path: Path, text: str, wanted: str) -> None
 
 def test_the_defaults_can_work() -> None:
     assert checked_config(Config()) == Config()
+
+
+@pytest.mark.parametrize("setting", [{"durability": "group"}, {"group_s": 1.0}, {"checkpoint_s": 1.0}])
+def test_what_is_of_a_journal_wants_one(setting: dict[str, Any]) -> None:
+    with pytest.raises(BadConfig, match="without a journal"):
+        checked_config(replace(Config(), **setting))
+    assert checked_config(replace(Config(journal="maps"), **setting))

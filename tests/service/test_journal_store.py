@@ -20,7 +20,15 @@ from factorbus.journal.checkpoints import file_of, read_checkpoint, remove_stran
 from factorbus.journal.digest import sealed
 from factorbus.journal.folders import left_behind, maps_in
 from factorbus.journal.lock import own
-from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalInUse, JournalVersion, MapThere, NoJournal
+from factorbus.journal.problems import (
+    BadFile,
+    JournalDamaged,
+    JournalFailed,
+    JournalInUse,
+    JournalVersion,
+    MapThere,
+    NoJournal,
+)
 from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Epoch, JournalRecord
 from factorbus.journal.store import FORM, NAME, Checkpoint, Store, create, open_store
 
@@ -276,7 +284,7 @@ def test_a_map_is_one_file_and_back(store: Store, tmp_path: Path) -> None:
     with pytest.raises(MapThere, match="there is a map 'n'"):
         import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
     (tmp_path / "broken").write_bytes((tmp_path / "m.fbmap").read_bytes()[:5000])
-    with pytest.raises(JournalDamaged):
+    with pytest.raises(BadFile, match="is damaged"):
         import_map(tmp_path / "broken", tmp_path / "other" / "b")
     assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["n"], "nothing half done is left"
 

@@ -70,6 +70,9 @@ def test_a_damaged_map_can_be_seen_and_given_up(services: Callable[..., Services
         shown = factorbus("stats", "--connect", endpoint)
         assert "does not open (damaged)" in " ".join(shown.stdout.split())
 
+        listed = " ".join(factorbus("maps", "--connect", endpoint).stdout.split())
+        assert "m does not open (damaged): `factorbus stats m` says why, `factorbus drop m --damaged` gives" in listed
+
         for call in (lambda: bus.map("m"), lambda: bus.drop("m"), lambda: bus.map("m", create=False)):
             code, text = code_of(call)
             assert (code, "--damaged" in text) == ("journal_damaged", True)

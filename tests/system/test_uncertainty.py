@@ -207,6 +207,16 @@ def test_the_command_line_asks(endpoint: str, square: tuple[Map, Solver], tmp_pa
     ran = ask("gate", name, str(file), *at, "--json")
     assert ran.returncode == 1, ran.stderr
     assert json.loads(ran.stdout)["candidates"][0]["plausible"] is False
+    for content in ("VERTEX_SE2 2 0 0 0\n", "EDGE_NOTHING 2 6 1\n", ""):
+        nothing = tmp_path / "nothing.g2o"
+        nothing.write_text(content)
+        for question in ("gate", "gain"):
+            ran = ask(question, name, str(nothing), *at)
+            assert (ran.returncode, ran.stdout, "[bad_file]" in ran.stderr) == (3, "", True)
+    mixed = tmp_path / "mixed.g2o"
+    mixed.write_text("EDGE_SE2 4 5 0 0 0 1 0 0 1 0 1\nEDGE_NOTHING 2 6 1\n")
+    assert ask("gate", name, str(mixed), *at, "--probability", "0.999999").returncode in (0, 1)
+    assert ask("gate", name, str(mixed), *at, "--strict").returncode == 3
     ran = ask("gain", name, str(file), *at)
     assert ran.returncode == 0, ran.stderr
     assert "between_se2 (x2, x6)" in ran.stdout

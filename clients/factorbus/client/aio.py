@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from factorbus.client import bus as sync
 from factorbus.client.aio_uncertainty import Uncertainty
 from factorbus.client.arguments import checked_seconds, of_type
-from factorbus.client.changes import Changes
+from factorbus.client.changes import Changes, some_of
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.filter_state import Factored, Grown
@@ -168,7 +168,7 @@ class Map:
 
     async def change(self, changes: Changes, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
         """Change what the map has: remove, weigh, fix, ...  Raises Refused, NoAnswerYet."""
-        return await self.insert(Batch(), changes=changes, settle=settle, timeout_s=timeout_s)
+        return await self.insert(Batch(), changes=some_of(changes), settle=settle, timeout_s=timeout_s)
 
     async def merge(
         self,

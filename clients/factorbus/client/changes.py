@@ -26,6 +26,9 @@ from factorbus.proto.problems import BadLoss, BadShape
 class Changes:
     """Changes to be made together or not at all, in this order.  Every method returns the same object, to be chained.
 
+    One without a key or a factor is refused (BadShape).  One that says what is so already, as `fix` of what is fixed,
+    is taken: it makes a revision like any other, in which nothing differs.
+
     Raises BadSymbol, BadShape, BadLoss, BadOption.
     """
 
@@ -34,7 +37,7 @@ class Changes:
 
     def remove_factors(self, factors: Iterable[int] | int) -> Changes:
         """These factors go."""
-        return self._add(Change("remove_factors", id_numbers("changes", factors)))
+        return self._add(Change("remove_factors", _factor_ids(factors)))
 
     def remove_variables(self, *keys: Key | Sequence[Key], alone: bool = False) -> Changes:
         """These variables go, with every factor on them; with `alone` it is refused (in_use) if there is any left."""
@@ -46,15 +49,18 @@ class Changes:
         accepted = of_type("changes: undo", accepted, Accepted, "the answer to the insert, an Accepted")
         brought = [group.keys for group in batch.variables]
         first = accepted.first_factor
-        self._add(Change("remove_factors", np.arange(first, first + batch.factor_count)))
-        return self._add(Change("remove_variables", keys=np.concatenate([*brought, np.empty(0, np.int64)]), alone=True))
+        if batch.factor_count:
+            self._add(Change("remove_factors", np.arange(first, first + batch.factor_count)))
+        if batch.variables:
+            self._add(Change("remove_variables", keys=np.concatenate(brought), alone=True))
+        return self
 
     def loss(self, factors: Iterable[int] | int, name: str, scale: ArrayLike | None = None) -> Changes:
         """These factors have this loss from now on; "none", or "", takes theirs away.
 
         scale: one, or one for each, standard deviations; None: that of `certainty.DEFAULT_SCALES`.
         """
-        ids = id_numbers("changes", factors)
+        ids = _factor_ids(factors)
         if isinstance(name, str) and name in ("", "none"):
             return self._add(Change("loss", ids, loss=""))
         name, usual = loss_of("changes", name)
@@ -65,7 +71,7 @@ class Changes:
 
     def weigh(self, factors: Iterable[int] | int, weight: ArrayLike) -> Changes:
         """The information matrices of these factors are multiplied by this (one, or one for each)."""
-        ids = id_numbers("changes", factors)
+        ids = _factor_ids(factors)
         weights = all_finite("changes: weight", _each("weight", weight, ids))
         return self._add(Change("weigh", ids, weight=weights))
 
@@ -114,10 +120,13 @@ class Changes:
     def repair(self, repaired: Repaired, loss: tuple[str, float] | str | None = None) -> Changes:
         """What is false goes, or gets a loss, ("dcs", 1.0) say; the map goes on from the repaired values."""
         of_type("changes: repair", repaired, Repaired, "an answer of `Map.repair`")
-        if loss is None:
+        name_and_scale = None if loss is None else loss_of("repair", loss)
+        if not repaired.factors.size:
+            return self.place(repaired.variables)
+        if name_and_scale is None:
             self.remove_factors(repaired.factors.tolist())
         else:
-            self.loss(repaired.factors.tolist(), *loss_of("repair", loss))
+            self.loss(repaired.factors.tolist(), *name_and_scale)
         return self.place(repaired.variables)
 
     def listed(self) -> tuple[Change, ...]:
@@ -129,9 +138,27 @@ class Changes:
         return self
 
 
+def some_of(changes: Changes) -> Changes:
+    """`changes`, if there are any.  Raises BadShape: they would make a revision in which nothing is changed."""
+    wanted = "a Changes with one change or more, such as Changes().fix('x0')"
+    if not of_type("changes", changes, Changes, wanted).listed():
+        raise BadShape("changes", "none", wanted)
+    return changes
+
+
+def _factor_ids(factors: Iterable[int] | int) -> I64:
+    return _some(id_numbers("changes", factors), "id of a factor")
+
+
 def _keys(keys: Sequence[Key | Sequence[Key]]) -> I64:
     """Keys one by one, or in lists."""
-    return np.concatenate([np.empty(0, np.int64), *map(key_numbers, keys)])
+    return _some(np.concatenate([np.empty(0, np.int64), *map(key_numbers, keys)]), "key")
+
+
+def _some(numbers: I64, what: str) -> I64:
+    if not numbers.size:
+        raise BadShape("changes", f"no {what}", f"one {what} or more")
+    return numbers
 
 
 def _each(name: str, numbers: ArrayLike, ids: I64) -> F64:

@@ -128,7 +128,9 @@ class Features:
         self._link.check_open("features")
         timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         if answer_size(ask) > ANSWER_LIMITS.max_bytes:
-            raise TooLarge("the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes")
+            raise TooLarge(
+                "the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes", "ask for fewer features at a time"
+            )
         started = time.monotonic()
         service = self._service or self._any_service(timeout_s)
         left = max(0.001, timeout_s - (time.monotonic() - started))

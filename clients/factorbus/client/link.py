@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
-from factorbus.client.listening import heard
+from factorbus.client.listening import heard, unresolved
 from factorbus.client.replies import AnswerReply, Failure, Reply, Silence, TimedOut
 from factorbus.proto import keys, redact
 from factorbus.proto.endpoints import checked_endpoint
@@ -194,7 +194,7 @@ def open_session(
         except zenoh.ZError:
             waited_s = time.monotonic() - start
             if listening_s is not None and waited_s >= min(listening_s, timeout_s) and not heard(endpoints):
-                raise NobodyListens(redact.endpoint(" and ".join(endpoints))) from None
+                raise NobodyListens(redact.endpoint(" and ".join(endpoints)), unresolved(endpoints)) from None
             if waited_s + pause > timeout_s:
                 raise Unavailable(
                     redact.endpoint(" and ".join(endpoints)),

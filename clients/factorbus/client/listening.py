@@ -12,13 +12,34 @@ def heard(endpoints: Iterable[str]) -> bool:
     return any(_may_be_there(endpoint) for endpoint in endpoints)
 
 
-def _may_be_there(endpoint: str) -> bool:
+def unresolved(endpoints: Iterable[str]) -> list[str]:
+    """The names of machines in `endpoints`, where none of them has an address; else nothing."""
+    names = []
+    for endpoint in endpoints:
+        protocol, host, _ = _parts(endpoint)
+        try:
+            if protocol not in _STREAMS:
+                return []
+            socket.getaddrinfo(host, None)
+            return []
+        except (socket.gaierror, UnicodeError):
+            names.append(host)
+    return names
+
+
+def _parts(endpoint: str) -> tuple[str, str, str]:
+    """(protocol, host, port)"""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    return protocol, host.strip("[]"), port
+
+
+def _may_be_there(endpoint: str) -> bool:
+    protocol, host, port = _parts(endpoint)
     if protocol not in _STREAMS or not port.isdecimal():
         return True  # nothing to be asked without speaking the protocol
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=_WAIT_S).close()
+        socket.create_connection((host, int(port)), timeout=_WAIT_S).close()
     except (ConnectionRefusedError, socket.gaierror, OverflowError):
         return False
     except OSError:

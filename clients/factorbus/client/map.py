@@ -14,7 +14,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import checked_flag, checked_seconds, of_type
-from factorbus.client.changes import Changes
+from factorbus.client.changes import Changes, some_of
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.key_numbers import Key
 from factorbus.client.link import Link
@@ -146,7 +146,7 @@ class Map:
 
     def change(self, changes: Changes, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
         """Change what the map has: remove, weigh, fix, ...  Raises Refused (the map is as it was), Unavailable."""
-        return self.insert(Batch(), changes=changes, settle=settle, timeout_s=timeout_s)
+        return self.insert(Batch(), changes=some_of(changes), settle=settle, timeout_s=timeout_s)
 
     def merge(
         self,

@@ -21,6 +21,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
@@ -32,10 +33,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from factorbus.client import Bus, Problem
 from factorbus.client.questions import logged
 from factorbus.gateway.documents import Document, estimate, groups
+from factorbus.gateway.documents import problem as document_of
 from factorbus.gateway.explain import explain
 from factorbus.gateway.live import follow_map
 from factorbus.gateway.maps import JoinedMaps
 from factorbus.proto.asking import AskWhy
+from factorbus.proto.problems import UnknownQuestion
 from factorbus.proto.symbols import format_symbol, parse_symbol
 from factorbus.viz.closures import closures_of
 
@@ -75,7 +78,7 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
         ],
         # A page of somebody else's that calls us by a name of its own does not get an answer.
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
-        exception_handlers={Problem: _problem},
+        exception_handlers={Problem: _problem, HTTPException: _no_answer},
     )
     app.router.redirect_slashes = False  # an address that the table above does not have is not there
     return app
@@ -181,6 +184,15 @@ def _is_ours(origin: str | None, host: str | None) -> bool:
 async def _problem(_: Request, problem: Exception) -> Response:
     code, message = getattr(problem, "code", "internal"), getattr(problem, "message", str(problem))
     detail: Any = getattr(problem, "detail", {})
-    return Document(
-        {"problem": {"code": code, "message": message, "detail": detail}}, status_code=_STATUS.get(code, 409)
-    )
+    return Document(document_of(code, message, detail), status_code=_STATUS.get(code, 409))
+
+
+async def _no_answer(request: Request, fault: Exception) -> Response:
+    """An address that there is not, or not for this method: below /api as a problem, like all others there."""
+    http = fault if isinstance(fault, HTTPException) else HTTPException(500)
+    status, headers = http.status_code, http.headers
+    if not request.url.path.startswith("/api/"):
+        return PlainTextResponse(http.detail, status, headers)
+    wanted = "an address below /api/maps, as clients/README.md lists them, and GET"
+    problem = UnknownQuestion(f"{request.method} {request.url.path}", wanted)
+    return Document(document_of(problem.code, problem.message, problem.detail), status_code=status, headers=headers)

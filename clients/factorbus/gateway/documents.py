@@ -11,6 +11,9 @@ from factorbus.proto.messages import Variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
+_EXACT = (1 << 53) - 1  # up to here JavaScript has every whole number
+_KEYS = ("key", "keys")  # fields of a problem's detail that name variables
+
 
 class Document(JSONResponse):
     """An answer as JSON, which has no word for what is not a finite number: null."""
@@ -30,6 +33,21 @@ def _finite(content: Any) -> Any:
     if isinstance(content, (list, tuple)):
         return [_finite(value) for value in content]
     return content
+
+
+def problem(code: str, message: str, detail: Any) -> dict[str, Any]:
+    """A problem: keys as they print, and other whole numbers that JavaScript would round as text."""
+    return {"problem": {"code": code, "message": message, "detail": _exact(detail)}}
+
+
+def _exact(content: Any, name: str = "") -> Any:
+    if isinstance(content, Mapping):
+        return {str(each): _exact(value, str(each)) for each, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_exact(value, name) for value in content]
+    if type(content) is int and name in _KEYS:
+        return format_symbol(content)
+    return str(content) if type(content) is int and abs(content) > _EXACT else content
 
 
 def groups(variables: Iterable[Variables]) -> list[dict[str, Any]]:

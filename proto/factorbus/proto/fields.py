@@ -36,15 +36,32 @@ def read_map(what: str, data: bytes, limits: MessageLimits) -> Map:
             data, max_array_len=limits.max_elements, max_map_len=limits.max_elements, strict_map_key=True, **hooks
         )
     except msgpack.StackError:
-        raise TooLarge(what, MAX_NESTING + 1, MAX_NESTING, "levels of nesting") from None
+        raise TooLarge(what, MAX_NESTING + 1, MAX_NESTING, "levels of nesting", "send it flatter") from None
     except (ValueError, TypeError, OverflowError) as error:
         if found := _TOO_MANY.match(str(error)):
             raise TooLarge(what, int(found[1]), limits.max_elements, "elements in one array or map") from None
-        why = str(error) or "a byte 0xc1, which begins nothing in MessagePack"
-        raise BadMessage(what, f"not readable ({why})", "one MessagePack map, and nothing after it") from None
+        raise BadMessage(
+            what, f"not readable ({_why_unreadable(error)})", "one MessagePack map, and nothing after it"
+        ) from None
     if type(content) is not dict:
         raise BadMessage(what, f"is {_name(content)}", "a map")
     return content
+
+
+def _why_unreadable(error: Exception) -> str:
+    """What is wrong with the bytes, in the words of the format and not of the library that reads them."""
+    said = str(error)
+    if isinstance(error, msgpack.ExtraData):
+        return "bytes follow the map"
+    if isinstance(error, msgpack.FormatError):
+        return "a byte 0xc1, which begins nothing in MessagePack"
+    if isinstance(error, UnicodeDecodeError):
+        return "a string that is not UTF-8"
+    if "incomplete input" in said or "exceeds max_" in said:
+        return "it ends too early"
+    if "map key" in said or isinstance(error, TypeError):
+        return "a key of a map that is no string"
+    return "a time stamp that is none" if "timestamp" in said or "nanoseconds" in said else "a value that is none"
 
 
 def integer(where: str, fields: Map, name: str, least: int = 0, default: int | None = None) -> int:

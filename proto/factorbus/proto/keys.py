@@ -28,9 +28,14 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 def checked_name(what: str, name: str, most: int = LONGEST_NAME) -> str:
     """`name`, if it may stand in a key.  Raises BadName; `what` says whose name it is, `most` how long it may be."""
-    if not isinstance(name, str) or len(name) > most or not _NAME.fullmatch(name):
+    if not is_name(name, most):
         raise BadName(what, name, most)
     return name
+
+
+def is_name(name: object, most: int = LONGEST_NAME) -> bool:
+    """Whether `name` may stand in a key."""
+    return isinstance(name, str) and len(name) <= most and _NAME.fullmatch(name) is not None
 
 
 def map_root(name: str) -> str:

@@ -167,10 +167,12 @@ class UnknownKind(BadMessage):
 class TooLarge(Problem):
     code = "too_large"
 
-    def __init__(self, what: str, size: int, limit: int, unit: str = "") -> None:
+    def __init__(
+        self, what: str, size: int, limit: int, unit: str = "", mend: str = "send it in parts or raise the limit"
+    ) -> None:
         unit = f" {unit}" if unit else ""
         super().__init__(
-            f"{what} has {size}{unit}, the limit is {limit}; send it in parts or raise the limit",
+            f"{what} has {size}{unit}, the limit is {limit}; {mend}",
             size=size,
             limit=limit,
         )
@@ -199,7 +201,7 @@ class UnknownMap(Problem):
         """known: the maps that there are, where that is known."""
         if known is None:
             super().__init__(
-                f"there is no map {name!r} here; create it, or ask admin/maps for those there are", map=name
+                f"there is no map {name!r} here; create it, or list the maps for those there are", map=name
             )
             return
         shown = ", ".join(sorted(known)[:_NAMED]) + (f" and {len(known) - _NAMED} more" if len(known) > _NAMED else "")
@@ -264,10 +266,16 @@ class Unavailable(Problem):
 class NobodyListens(Unavailable):
     """The address is that of a machine where nothing listens: no service, and no router."""
 
-    def __init__(self, endpoint: str) -> None:
-        Problem.__init__(
-            self, f"nothing listens at {endpoint}; start a service there with `factorbus serve`, or check the address"
+    def __init__(self, endpoint: str, unresolved: Sequence[str] = ()) -> None:
+        """unresolved: names of machines in it that have no address."""
+        seen, mend = (
+            f"nothing listens at {endpoint}",
+            "start a service there with `factorbus serve`, or check the address",
         )
+        if unresolved:
+            seen = f"{endpoint} leads nowhere: there is no address for the name {' and '.join(unresolved)}"
+            mend = "is it spelt right, and does this machine's name service (DNS, /etc/hosts) know it?"
+        Problem.__init__(self, f"{seen}; {mend}")
 
 
 class ClosedHere(Unavailable):
@@ -328,7 +336,7 @@ class NotConverged(Problem):
 
     def __init__(self, name: str, revision: int, waited_s: float, gave_up: str) -> None:
         seen = f"map {name!r} has not converged to its optimum at revision {revision}"
-        wanted = f"after {waited_s:g} s; it goes on by itself: wait longer, or look at ask/stats"
+        wanted = f"after {waited_s:g} s; it goes on by itself: wait longer, or look at the stats of the map"
         if gave_up:
             wanted = f"and goes on no more by itself: {gave_up}; `settle` it, or ask `repair` what is wrong in it"
         super().__init__(f"{seen} {wanted}", revision=revision, waited_s=waited_s, gave_up=gave_up)

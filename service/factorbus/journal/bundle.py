@@ -9,26 +9,31 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from factorbus.journal.checkpoints import file_of
-from factorbus.journal.folders import IMPORTING, make_beside, sync_folder
-from factorbus.journal.problems import JournalDamaged, JournalFailed, MapThere, NoJournal
-from factorbus.journal.store import NAME, open_store, what_reading_failed_with
+from factorbus.journal.connecting import APPLICATION
+from factorbus.journal.folders import IMPORTING, is_map, make_beside, maps_in, sync_folder
+from factorbus.journal.problems import BadFile, JournalDamaged, JournalVersion, MapThere, NoJournal, NotWritten
+from factorbus.journal.store import NAME, Store, open_store, what_reading_failed_with
 from factorbus.ownership import private_file
 
 _PIECE = 32 << 20
+# How a database of SQLite begins, and where it has the number of the application that it belongs to.
+_MAGIC, _APPLICATION_AT, _HEADER_BYTES = b"SQLite format 3\0", 68, 100
 _TABLE = "CREATE TABLE piece (record INTEGER NOT NULL, number INTEGER NOT NULL, bytes BLOB NOT NULL)"
 
 
 def export_map(folder: Path, file: Path) -> int:
     """The map in `folder`, as it is now, into `file`, all of it or nothing; gives the revision that it is at there.
 
-    Raises NoJournal, JournalDamaged, JournalVersion, JournalFailed.
+    Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable, NotWritten.
     """
     beside = file.with_name(f".{file.name}.part")
-    beside.unlink(missing_ok=True)
-    store = open_store(folder, read_only=True)
+    store = _open_one_of(folder)
     try:
+        beside.unlink(missing_ok=True)
         store.copy_to(beside)
         saved = store.checkpoints()
+    except OSError as error:
+        raise NotWritten(file, str(error)) from None
     finally:
         store.close()
     try:
@@ -43,18 +48,17 @@ def export_map(folder: Path, file: Path) -> int:
         return revision
     except (sqlite3.Error, OSError) as error:
         beside.unlink(missing_ok=True)
-        raise JournalFailed(file, str(error)) from None
+        raise NotWritten(file, str(error)) from None
 
 
 def import_map(file: Path, folder: Path) -> None:
     """The map in `file` into `folder`, which must not be there yet; all of it or nothing.
 
-    Raises NoJournal, MapThere, JournalDamaged, JournalVersion, JournalFailed.
+    Raises BadFile, MapThere, JournalVersion, JournalUnreadable, NotWritten.
     """
-    if not file.is_file():
-        raise NoJournal(file)
     if folder.exists():
         raise MapThere(folder)
+    _check_exported(file)
     beside = folder.with_name(f"{IMPORTING}{folder.name}")
     shutil.rmtree(beside, ignore_errors=True)
     try:
@@ -62,23 +66,57 @@ def import_map(file: Path, folder: Path) -> None:
         with file.open("rb") as source, open(beside / NAME, "xb", opener=private_file) as target:
             shutil.copyfileobj(source, target)
         open_store(beside, read_only=True).close()
-        with _opened(beside / NAME) as database:
-            for record, content in _pieces(database):
-                with open(file_of(beside, record), "ab", opener=private_file) as checkpoint:
-                    checkpoint.write(content)
-            database.execute("DROP TABLE IF EXISTS piece")
-            database.execute("UPDATE header SET value = ? WHERE name = 'map'", (folder.name,))
+        _unpack(beside, folder.name)
         _check(beside)
         sync_folder(beside)
         beside.rename(folder)
         sync_folder(folder.parent)
+    except JournalVersion as version:
+        raise JournalVersion(file, int(version.detail["seen"]), int(version.detail["wanted"])) from None
+    except JournalDamaged as damaged:
+        raise BadFile(file, f"is damaged: {damaged.detail['what']}") from None
     except sqlite3.DatabaseError as error:
-        problem = what_reading_failed_with(file, error)
-        raise (problem if isinstance(problem, JournalDamaged) else JournalFailed(folder, str(error))) from None
+        if isinstance(what_reading_failed_with(file, error), JournalDamaged):
+            raise BadFile(file, f"is damaged: {error}") from None
+        raise NotWritten(folder, str(error)) from None
     except OSError as error:
-        raise JournalFailed(folder, str(error)) from None
+        raise NotWritten(folder, str(error)) from None
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+def _open_one_of(folder: Path) -> Store:
+    """The map in `folder`; where there is none, those beside it are named.  Raises NoJournal, JournalDamaged, ..."""
+    try:
+        return open_store(folder, read_only=True)
+    except NoJournal:
+        if not folder.parent.is_dir():
+            raise NoJournal(folder.parent) from None
+        if is_map(folder, NAME):
+            raise JournalDamaged(folder, f"{NAME} is missing beside what was written with it") from None
+        raise NoJournal(folder, tuple(maps_in(folder.parent, NAME))) from None
+
+
+def _check_exported(file: Path) -> None:
+    """Raises BadFile for what cannot be read, and for what is no database or one of something else."""
+    try:
+        with file.open("rb") as source:
+            begins = source.read(_HEADER_BYTES)
+    except OSError as error:
+        raise BadFile(file, f"cannot be read: {error.strerror}") from None
+    application = int.from_bytes(begins[_APPLICATION_AT : _APPLICATION_AT + 4], "big")
+    if not begins.startswith(_MAGIC) or application != APPLICATION:
+        raise BadFile(file, "is no exported map")
+
+
+def _unpack(folder: Path, name: str) -> None:
+    """Checkpoints that are in the database become files beside it, which is that of map `name`."""
+    with _opened(folder / NAME) as database:
+        for record, content in _pieces(database):
+            with open(file_of(folder, record), "ab", opener=private_file) as checkpoint:
+                checkpoint.write(content)
+        database.execute("DROP TABLE IF EXISTS piece")
+        database.execute("UPDATE header SET value = ? WHERE name = 'map'", (name,))
 
 
 def _opened(path: Path) -> "_Database":

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Container
 from pathlib import Path
 
 from factorbus.journal.problems import UnsafeJournal
@@ -13,9 +14,13 @@ _WHAT = "the journal"
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
-def maps_in(folder: Path, file: str) -> list[str]:
-    """The maps in `folder`: names of folders that have `file`, or what is written beside it, in order."""
-    return sorted(path.name for path in folder.iterdir() if _NAME.fullmatch(path.name) and is_map(path, file))
+def maps_in(folder: Path, file: str, known: Container[str] = ()) -> list[str]:
+    """The maps in `folder`: names of folders that have `file`, or what is written beside it, in order.
+
+    known: names that are not looked at and not returned.
+    """
+    named = [path for path in folder.iterdir() if _NAME.fullmatch(path.name) and path.name not in known]
+    return sorted(path.name for path in named if is_map(path, file))
 
 
 def is_map(folder: Path, file: str) -> bool:

@@ -20,6 +20,30 @@ class JournalFailed(Problem):
         )
 
 
+class NotWritten(JournalFailed):
+    """A file or folder cannot be written, outside of a map at work: what was to be done is not done."""
+
+    def __init__(self, where: Path, reason: str, undone: str = "nothing was changed") -> None:
+        Problem.__init__(
+            self,
+            f"{where} cannot be written ({reason}): {undone}. Make room there, or name a folder that this user may "
+            "write to, and begin again",
+            reason=reason,
+        )
+
+
+class BadFile(Problem):
+    """A file that is to be imported is no exported map, or not a whole one."""
+
+    code = "bad_file"
+
+    def __init__(self, file: Path, what: str) -> None:
+        super().__init__(
+            f"{file} {what}; wanted a file that `factorbus export` wrote, as it wrote it. Nothing was imported",
+            path=str(file),
+        )
+
+
 class JournalInUse(Problem):
     """Another process owns the folder."""
 

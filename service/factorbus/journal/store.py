@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 from factorbus.journal import chain
 from factorbus.journal.connecting import APPLICATION, FORM, connected, connection_to, what_reading_failed_with
 from factorbus.journal.digest import digest_of
+from factorbus.journal.faults import told_faults
 from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_folder
-from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal
+from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal, NotWritten
 from factorbus.journal.records import Entry, Epoch, Header, JournalRecord, Maker, Sender
 from factorbus.ownership import private_file
 
@@ -222,16 +223,15 @@ class Store:
     def check_form(self) -> None:
         """That tables and index are what SQLite made, not yet what is in them.  Raises JournalDamaged."""
         with self._reading():
-            (said,) = self._db.execute("PRAGMA integrity_check(1)").fetchone()
-        if said != "ok":
-            raise JournalDamaged(self.path, said)
+            faults = told_faults(self._db.execute("PRAGMA integrity_check(1)"))
+        if faults:
+            raise JournalDamaged(self.path, faults)
 
     def check(self) -> Iterator[str]:
         """Everything that is wrong with it: by SQLite's own check, by inserts' bytes, by clients' numbers."""
         try:
-            for (said,) in self._db.execute("PRAGMA integrity_check(20)"):
-                if said != "ok":
-                    yield said
+            if faults := told_faults(self._db.execute("PRAGMA integrity_check(20)")):
+                yield faults
             yield from self._check_sequences()
             revision = 0
             for record in self.records():
@@ -245,12 +245,12 @@ class Store:
             yield str(error)
 
     def copy_to(self, path: Path) -> None:
-        """A copy in one file, consistent also while somebody writes.  Raises JournalFailed."""
+        """A copy in one file, consistent also while somebody writes.  Raises NotWritten."""
         try:
             open(path, "xb", opener=private_file).close()  # into an empty file it writes as into none
             self._db.execute("VACUUM INTO ?", (str(path),))
         except (OSError, sqlite3.Error) as error:
-            raise JournalFailed(path, str(error)) from None
+            raise NotWritten(path, str(error)) from None
 
     def close(self) -> None:
         """Close it; what is in the log is moved to the database first, where that is possible."""

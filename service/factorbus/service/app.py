@@ -212,7 +212,7 @@ class Shell:
             return
         found = self.maps.get(name)
         if found is None:
-            self._delivery.refusals.hand(self._no_map, query, name, _FIRST)
+            self._delivery.refusals.hand(self._no_map, query, name, self._on_insert, _FIRST)
             return
         read = read_insert(query, client, payload, self._decoding, time.monotonic())
         if isinstance(read, Refuse):
@@ -227,7 +227,7 @@ class Shell:
         name, question = _chunks(query)
         found = self.maps.get(name)
         if found is None:
-            self._delivery.refusals.hand(self._no_map, query, name)
+            self._delivery.refusals.hand(self._no_map, query, name, self._on_question)
         else:
             found.host.ask(ArrivedQuestion(query, question, payload_of(query)))
 
@@ -270,7 +270,17 @@ class Shell:
     def _fork(self, asker: Asker, question: Question, taken: QuestionCopies) -> None:
         self._control.hand(self.maps.forked, asker, question, taken)
 
-    def _no_map(self, query: Asker, name: str, following: int | None = None) -> None:
+    def _no_map(self, query: Asker, name: str, again: Callable[[Asker], None], following: int | None = None) -> None:
+        """again: takes the query anew, once the map is open."""
+        if self.maps.is_new_on_disk(name):
+            if (waiting := self._control.waiting) < _ADMIN_WAITING:
+                self._control.hand(self._open_new, query, name, again, following)
+            else:
+                refuse(query, Busy(waiting, 0.1), following)
+        else:
+            self._refuse_missing(query, name, following)
+
+    def _refuse_missing(self, query: Asker, name: str, following: int | None) -> None:
         if problem := self.maps.missing(name):
             refuse(query, problem, following)
         else:
@@ -278,9 +288,22 @@ class Shell:
 
     # ---- on the control thread, which sends nothing itself to a peer that may not read -----------------------------
 
+    def _open_new(self, query: Asker, name: str, again: Callable[[Asker], None], following: int | None) -> None:
+        try:
+            found = self.maps.find(name)
+        except Problem as problem:
+            self._delivery.refusals.hand(refuse, query, problem, following)
+            return
+        if found is not None:
+            again(query)
+        else:
+            self._delivery.refusals.hand(self._refuse_missing, query, name, following)
+
     def _administer(self, query: Asker) -> None:
         operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)
         try:
+            if operation in ("maps", "stats"):
+                self.maps.open_new()
             if operation == "maps":
                 told = {"maps": self.maps.rows(), "service": self._service, "version": __version__, "protocol": known()}
                 self._delivery.answer(query, codec.encode_map(told))

@@ -134,10 +134,19 @@ def checked_config(config: Config) -> Config:
         raise BadConfig(f"durability is {config.durability!r}; wanted {', '.join(DURABILITIES)}")
     if config.standby and not config.journal:
         raise BadConfig("standby without a journal: there is nothing to take over; give journal = DIR")
+    usual = Config()
+    for name in ("durability", "group_s", "checkpoint_s"):
+        if getattr(config, name) != getattr(usual, name) and not config.journal:
+            raise needs_journal(name)
     stem = config.maps.removesuffix("*")
     if not config.maps or not all(c.isalnum() or c in "_-" for c in stem) or not stem.isascii():
         raise BadConfig(f"maps is {config.maps!r}; wanted a map name or the beginning of one and a *, such as site7-*")
     return config
+
+
+def needs_journal(name: str) -> BadConfig:
+    """`name` is set, and there is no journal that it could be of."""
+    return BadConfig(f"{name} without a journal: maps end with the service; give journal = DIR")
 
 
 def _build(kind: type, content: Mapping[str, Any], where: str) -> Any:

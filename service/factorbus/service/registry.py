@@ -8,6 +8,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,6 +120,37 @@ class Maps:
                     log.error("map %s does not come back: %s", name, problem)
                     self._unopened[name] = problem
 
+    def is_new_on_disk(self, name: str) -> bool:
+        """Whether map `name` came to the disk while this service was at work (`factorbus import`).  For any thread."""
+        if self._library is None or not keys.is_name(name) or not ours(self._config.maps, name):
+            return False
+        return name not in self._known() and self._library.has(name)
+
+    def find(self, name: str) -> OpenMap | None:
+        """Map `name`, opened first if it is new on disk, as at the start beyond `limits.maps` too.  Raises Problem."""
+        if self.is_new_on_disk(name):
+            if self._stopping:
+                raise ShuttingDown
+            try:
+                self._open(name, self._make(name, None))
+            except Problem as problem:
+                log.error("map %s, new on disk, does not open: %s", name, problem)
+                self._unopened[name] = problem
+                raise
+        return self._maps.get(name)
+
+    def open_new(self) -> None:
+        """Open all that are new on disk; of one that does not, `unopened` tells."""
+        if self._library is None or self._stopping:
+            return
+        for name in self._library.names(self._known()):
+            with suppress(Problem):
+                self.find(name)
+
+    def _known(self) -> set[str]:
+        """Names that are open, do not open, or are on their way out."""
+        return {*list(self._maps), *list(self._unopened), *(gone.host.core.name for gone in list(self._leaving))}
+
     def announce(self) -> None:
         """Last of all: alive means askable."""
         for found in self._maps.values():
@@ -144,10 +176,9 @@ class Maps:
 
     def fork(self, asker: Asker, fork: Fork) -> None:
         """Have a new map begin as another one is, and answer with its row: `forked` goes on.  Raises Problem."""
-        found = self._maps.get(fork.source)
-        if found is None and not ours(self._config.maps, fork.source):
+        if not ours(self._config.maps, fork.source):
             raise NotHere(fork.source, self._config.maps)
-        if found is None:
+        if (found := self.find(fork.source)) is None:
             raise self._unopened.get(fork.source) or UnknownMap(fork.source)
         if self._answered_again(asker, fork):
             return
@@ -176,7 +207,12 @@ class Maps:
         Raises MovedOn, NotDamaged, JournalFailed; what is `missing`.
         """
         name, revision, damaged = drop
-        found = self._maps.get(name)
+        try:
+            found = self.find(name)
+        except Problem:
+            if not damaged:
+                raise
+            found = None
         if damaged and found is not None:
             raise NotDamaged(name)
         if damaged and name in self._unopened and self._library is not None:
@@ -283,7 +319,8 @@ class Maps:
         if self._stopping:
             raise ShuttingDown
         if len(self._maps) >= self._config.limits.maps:
-            raise TooLarge("the service", len(self._maps) + 1, self._config.limits.maps, "maps")
+            mend = "drop one, or raise the limit"
+            raise TooLarge("the service", len(self._maps) + 1, self._config.limits.maps, "maps", mend)
         if (full := self._memory.no_room(0)) is not None:
             raise full
 

@@ -132,6 +132,7 @@ class UnknownVariable(SolverError):
     code = "unknown_variable"
 
     def __init__(self, key: int, factor: str) -> None:
+        self.key, self.factor = key, factor
         super().__init__(
             f"{factor}: there is no variable {printed(key)}; add it in this batch or before", key=key, keys=[key]
         )
@@ -291,7 +292,7 @@ class UnknownFactor(SolverError):
     def __init__(self, factor: int, following: int) -> None:
         seen = "it has been removed" if 0 <= factor < following else f"the next one will be {following}"
         super().__init__(
-            f"there is no factor {factor}: {seen}; ids are told in the answer to an insert, and in ask/graph",
+            f"there is no factor {factor}: {seen}; ids are in the answer to an insert, and in the graph of the map",
             factor=factor,
         )
 
@@ -301,7 +302,7 @@ class NotInMap(SolverError):
 
     def __init__(self, key: int, change: str) -> None:
         super().__init__(
-            f"{change}: there is no variable {printed(key)}, or not any more; ask/estimate has those there are",
+            f"{change}: there is no variable {printed(key)}, or not any more; the map's estimate has those there are",
             key=key,
             keys=[key],
         )

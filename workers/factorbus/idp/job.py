@@ -26,7 +26,9 @@ def done(shard: Shard, ask: Ask) -> ShardDone:
     if last > n:
         raise BadMessage("last", f"is {last}", f"at most {n}, the number of pixels")
     if answer_size(ask) > ANSWER_LIMITS.max_bytes:
-        raise TooLarge("the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes")
+        raise TooLarge(
+            "the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes", "ask for fewer features at a time"
+        )
     seen = see(ask.sighting)
     y = seen.y[first:last]
     if ask.form == "factored":
@@ -55,7 +57,13 @@ def _stored(shard: Shard, ask: Ask, segment: Segment, seen: Seen) -> bool:
 def _rows(shard: Shard, ask: Ask, seen: Seen) -> np.ndarray:
     n, m = ask.sighting.count, ask.sighting.width
     if (size := new_rows_size(n, m)) > ANSWER_LIMITS.max_bytes:
-        raise TooLarge("the answer, which cannot go to shared memory,", size, ANSWER_LIMITS.max_bytes, "bytes")
+        raise TooLarge(
+            "the answer, which cannot go to shared memory,",
+            size,
+            ANSWER_LIMITS.max_bytes,
+            "bytes",
+            "ask for fewer features at a time",
+        )
     rows = np.empty((FEATURE * (shard.last - shard.first), m + FEATURE * n))
     FeatureRows(ask.sighting, seen).rows(shard.first, shard.last, rows)
     return rows

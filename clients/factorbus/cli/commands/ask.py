@@ -12,7 +12,7 @@ from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import FAILED, OK, input_file
 from factorbus.cli.output.starts import NOT_CONVERGED, optimum_from, ratio_to
 from factorbus.cli.process.options import MapAddress, Number, asks_map, file_argument
-from factorbus.cli.process.reading import read_graph
+from factorbus.cli.process.reading import read_graph, reading_options
 from factorbus.wording import counted
 
 _SHOWN = 20  # more false factors than these are listed with --json only
@@ -100,17 +100,21 @@ def covariance_command(address: MapAddress, keys: tuple[str, ...], as_json: bool
 @command.command("gate")
 @asks_map
 @file_argument("candidates")
+@reading_options
 @_probability
-def gate_command(address: MapAddress, candidates: Path, probability: float, as_json: bool) -> int:
+def gate_command(
+    address: MapAddress, candidates: Path, dialect: str | None, strict: bool, probability: float, as_json: bool
+) -> int:
     """Whether the factors in the file CANDIDATES are plausible; the exit code is 1 when one is not.
 
     The file is g2o, TORO, iSAM, SLAM++ or PyFactorGraph text. Its keys are those of the map; its vertices are not
     looked at.
+    A file without a factor that can be read is refused (3); with --strict, so is one of which anything is left out.
 
     \b
     factorbus ask gate warehouse candidates.g2o --probability 0.99
     """
-    read = _read(candidates)
+    read = _read(candidates, dialect, strict)
     factors = read.batch.factors
     with _map(address) as joined:
         found = joined.uncertainty.ask.gate(factors, probability, address.timeout_s).result()
@@ -135,13 +139,14 @@ def gate_command(address: MapAddress, candidates: Path, probability: float, as_j
 @command.command("gain")
 @asks_map
 @file_argument("candidates")
-def gain_command(address: MapAddress, candidates: Path, as_json: bool) -> int:
+@reading_options
+def gain_command(address: MapAddress, candidates: Path, dialect: str | None, strict: bool, as_json: bool) -> int:
     """How much information each of the factors in the file CANDIDATES would bring by itself, in nats, the most first.
 
     \b
     factorbus ask gain warehouse candidates.g2o
     """
-    read = _read(candidates)
+    read = _read(candidates, dialect, strict)
     factors = read.batch.factors
     with _map(address) as joined:
         found = joined.uncertainty.ask.gain(factors, address.timeout_s).result()
@@ -354,9 +359,16 @@ def _word(plausible: bool) -> str:
     return "plausible" if plausible else "not plausible"
 
 
-def _read(path: Path) -> Any:
+def _read(path: Path, dialect: str | None, strict: bool) -> Any:
+    """The graph file of candidates.  Raises FormatError, also where it has no factor."""
+    from factorbus.formats.errors import FormatError
+
     with input_file(path):
-        return read_graph(path)
+        # The vertices that no edge names are not asked about: only what would be asked may not be left out.
+        found = read_graph(path, dialect, strict, whole=True)
+    if not found.batch.factor_count:
+        raise FormatError(str(path), None, "it has no factor that can be read", "one candidate or more")
+    return found
 
 
 def _described(factors: tuple[Any, ...]) -> list[str]:

@@ -4,6 +4,7 @@ import click
 
 from factorbus.cli.output.exits import require
 from factorbus.cli.process.children import READY
+from factorbus.cli.process.exposure import insecure_option, refuse_open_page
 from factorbus.cli.process.options import connect_option, zenoh_option
 
 
@@ -17,18 +18,23 @@ from factorbus.cli.process.options import connect_option, zenoh_option
 @click.option(
     "--name", "names", multiple=True, metavar="NAME", help="A name by which browsers call this machine, or '*'."
 )
+@insecure_option
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
-def command(endpoint: str, zenoh: str, host: str, port: int, names: tuple[str, ...], until_eof: bool) -> None:
+def command(
+    endpoint: str, zenoh: str, host: str, port: int, names: tuple[str, ...], insecure: bool, until_eof: bool
+) -> None:
     """Serve maps to browsers: a page with the live map, and the same over HTTP and WebSocket, to read only.
 
-    Click a pose or a landmark to see what holds it where it is. Until Ctrl-C.
+    Click a pose or a landmark to see what holds it where it is. Until Ctrl-C. It asks nobody who they are, so it serves
+    this machine alone; others only with --insecure. What it answers over HTTP is in clients/README.md.
 
     \b
     factorbus gateway
-    factorbus gateway --connect tcp/robot.local:7447 --host 0.0.0.0 --name robot.local
+    factorbus gateway --connect tcp/robot.local:7447 --host 0.0.0.0 --name robot.local --insecure
     curl http://127.0.0.1:8080/api/maps/warehouse/variables/x12
     """
     require("gateway", "factorbus gateway")
+    refuse_open_page(host, insecure)
     from factorbus.cli.process.bus import open_bus
     from factorbus.cli.process.stopping import stop_on_signals, wait_until
     from factorbus.gateway import make_app

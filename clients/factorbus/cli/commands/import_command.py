@@ -22,9 +22,9 @@ from factorbus.proto.keys import checked_name
 def command(file: Path, folder: Path, name: str | None) -> None:
     """Put the map that `factorbus export` wrote to FILE into a service's journal.
 
-    It is checked first, and is there whole or not at all. A service that is at work opens it when a client joins; one
-    that starts, at once. Its epoch and the places of its clients come with it, so they go on where they were: see to it
-    that the map has only one owner.
+    It is checked first, and is there whole or not at all. A service that is at work lists it, and opens it when
+    somebody lists maps, asks for it, joins it or drops it; one that starts, at once. Its epoch and the places of its
+    clients come with it, so they go on where they were: see to it that the map has only one owner.
 
     \b
     factorbus import warehouse.fbmap --journal /var/lib/factorbus

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output import console as screen
-from factorbus.cli.output.exits import FAILED, OK, require
+from factorbus.cli.output.exits import FAILED, OK, report, require
 from factorbus.cli.process.options import json_option
 from factorbus.wording import counted
 
@@ -20,6 +20,11 @@ _FOLDER = click.option(
     required=True,
     metavar="DIR",
     help="The folder that `factorbus serve` has.",
+)
+
+_NEXT = (
+    "restore its folder from a copy, or give it up with `factorbus drop {name} --damaged` and `factorbus import` an "
+    "exported file; what only makes it slower to open needs nothing"
 )
 
 
@@ -38,23 +43,40 @@ def command() -> None:
 @_MAP
 @_FOLDER
 @json_option
-def show(names: tuple[str, ...], folder: Path, as_json: bool) -> None:
-    """What there is of MAP, or of every map."""
-    rows = []
-    for name, store in _stores(folder, names):
-        header, last = store.header(), store.last()
-        counts = store.counts()
-        rows.append(
-            {"map": name, "mode": header.mode, "epoch": header.epoch, "revision": last.revision, **counts}
-            | {"checkpoints": [saved.record for saved in store.checkpoints()], "durability": header.durability}
-            | {"epochs": [epoch.because for epoch in header.epochs], "closed_in_order": header.clean}
-            | {"builds": [{"from_record": maker.record, **maker.build} for maker in store.makers()]}
-            | {"differs": next((saved.differs for saved in store.checkpoints()), "")}
-        )
+def show(names: tuple[str, ...], folder: Path, as_json: bool) -> int:
+    """What there is of MAP, or of every map. One that does not open hides no other; the exit code is then 5."""
+    from factorbus.proto.problems import Problem
+
+    rows, code = list[dict[str, Any]](), OK
+    for name in _names(folder, names):
+        try:
+            with _open(folder / name) as store:
+                rows.append({"map": name, **_row(store)})
+        except Problem as problem:
+            code = report(problem, as_json=False, debug=False)
+            rows.append({"map": name, "code": problem.code, "problem": problem.message})
     if as_json:
         screen.document({"maps": rows})
     for row in () if as_json else rows:
-        screen.table([(key, str(value)) for key, value in row.items() if key != "map"], title=row["map"])
+        cells = [("does not open", row["code"])] if "code" in row else list(row.items())[1:]
+        screen.table([(key, str(value)) for key, value in cells], title=row["map"])
+    return code
+
+
+def _row(store: Any) -> dict[str, Any]:
+    header, last, saved, makers = store.header(), store.last(), store.checkpoints(), store.makers()
+    return {
+        "mode": header.mode,
+        "epoch": header.epoch,
+        "revision": last.revision,
+        **store.counts(),
+        "checkpoints": [each.record for each in saved],
+        "durability": header.durability,
+        "epochs": [epoch.because for epoch in header.epochs],
+        "closed_in_order": header.clean,
+        "builds": [{"from_record": maker.record, **maker.build} for maker in makers],
+        "differs": next((each.differs for each in saved), ""),
+    }
 
 
 @command.command()
@@ -68,6 +90,8 @@ def check(names: tuple[str, ...], folder: Path) -> int:
         click.echo(f"{name}: {'sound' if not wrong else 'NOT SOUND'}")
         for each in wrong:
             click.echo(f"  {each}")
+        if wrong:
+            click.echo(f"  {_NEXT.format(name=name)}")
         sound = sound and not wrong
     return OK if sound else FAILED
 
@@ -99,33 +123,38 @@ def verify(names: tuple[str, ...], folder: Path) -> int:
     which the values differ.
     """
     require("service", "factorbus journal verify")
+    from factorbus.proto.problems import Problem
+
+    alike, code = True, OK
+    for name in _names(folder, names):
+        try:
+            with _open(folder / name) as store:
+                alike = _verified(name, store) and alike
+        except Problem as problem:
+            click.echo(f"{name}: cannot be verified")
+            code = report(problem, as_json=False, debug=False)
+    return code or (OK if alike else FAILED)
+
+
+def _verified(name: str, store: Any) -> bool:
+    """Whether it gives the same to the bit, and say so.  Raises JournalDamaged, JournalDiffers, JournalOption."""
     from factorbus.service.config import Limits
     from factorbus.service.journal.library import make_map_solver
     from factorbus.service.journal.recovery import verify as run_again
 
-    alike = True
-    for name, store in _stores(folder, names):
-        header, total = store.header(), store.last().record
-        again = make_map_solver(header.mode, header.options, header.epoch, Limits())
-        revision, differs = 0, 0
-        with screen.progress(name, total) as show_progress:
-            for record, same in run_again(store, again):
-                revision = record.revision
-                differs = differs or (0 if same else revision)
-                show_progress(record.number, f"revision {revision}")
-        if differs:
-            click.echo(f"{name}: values differ from revision {differs} on (of {revision})")
-        else:
-            click.echo(f"{name}: {counted(total, 'record')}, {counted(revision, 'revision')}, all the same to the bit")
-        alike = alike and not differs
-    return OK if alike else FAILED
-
-
-def _stores(folder: Path, names: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-    """Each of `names`, or each there is, with its journal open for reading.  Raises Problem."""
-    for name in _names(folder, names):
-        with _open(folder / name) as store:
-            yield name, store
+    header, total = store.header(), store.last().record
+    again = make_map_solver(header.mode, header.options, header.epoch, Limits())
+    revision, differs = 0, 0
+    with screen.progress(name, total) as show_progress:
+        for record, same in run_again(store, again):
+            revision = record.revision
+            differs = differs or (0 if same else revision)
+            show_progress(record.number, f"revision {revision}")
+    if differs:
+        click.echo(f"{name}: values differ from revision {differs} on (of {revision})")
+    else:
+        click.echo(f"{name}: {counted(total, 'record')}, {counted(revision, 'revision')}, all the same to the bit")
+    return not differs
 
 
 def _names(folder: Path, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ def command(endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> None:
     """List the maps of the service at ENDPOINT; at a router, those of all services.
 
     The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
+    A map that is on the service's disk and does not open is listed as that.
 
     \b
     factorbus maps
@@ -40,6 +41,10 @@ def command(endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> None:
 
 
 def _told(row: "MapRow") -> str:
+    if row.problem:
+        why, way = f"`factorbus stats {row.name}` says why", f"`factorbus drop {row.name} --damaged` gives it up"
+        return f"does not open ({row.state}): {why}, {way}"
+    blocked = "; blocked: its journal cannot be written" if row.state == "blocked" else ""
     held = f"{counted(row.variables, 'variable')}, {counted(row.factors, 'factor')}"
     caveat = "" if row.reproducible is not False else "; not reproducible"
-    return f"{held}, revision {row.revision:,}, mode {row.mode}{caveat}"
+    return f"{held}, revision {row.revision:,}, mode {row.mode}{caveat}{blocked}"

@@ -95,10 +95,14 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
 def _settings(path: Path | None, given: dict[str, Any]) -> Any:
     from dataclasses import replace
 
-    from factorbus.service.config import Config, checked_config, load_config
+    from factorbus.service.config import Config, checked_config, load_config, needs_journal
 
     given = {name: value for name, value in given.items() if value not in (None, ())}
     if path is None:
-        return checked_config(replace(Config(), **given))
-    with input_file(path):
-        return load_config(path, **given)
+        config = checked_config(replace(Config(), **given))
+    else:
+        with input_file(path):
+            config = load_config(path, **given)
+    if "durability" in given and not config.journal:
+        raise needs_journal("durability")
+    return config

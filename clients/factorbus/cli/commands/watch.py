@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import require
+from factorbus.cli.process.exposure import insecure_option, refuse_open_page
 from factorbus.cli.process.options import (
     Number,
     connect_option,
@@ -28,6 +29,7 @@ class ViewOptions:
     host: str
     web_port: int
     data_port: int
+    insecure: bool
 
 
 @click.command()
@@ -42,6 +44,7 @@ class ViewOptions:
 )
 @click.option("--web-port", type=click.IntRange(1, 65535), default=9090, show_default=True, metavar="PORT")
 @click.option("--data-port", type=click.IntRange(1, 65535), default=9876, show_default=True, metavar="PORT")
+@insecure_option
 @click.option("--rate", type=Number(0.1, 60), default=5.0, show_default=True, metavar="HZ", help="Looks a second.")
 @ellipses_option(30)
 @click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
@@ -58,17 +61,19 @@ def command(
 ) -> None:
     """Watch MAP live in Rerun: trajectory, landmarks, loop closures by how badly they fit, and plots of every step.
 
-    Opens the Rerun viewer; where there is no display, serves it to browsers of this machine, or with --host to all who
-    can reach that address. A map that is not there yet is waited for. Until Ctrl-C.
+    Opens the Rerun viewer; where there is no display, serves it to browsers of this machine, or with --host and
+    --insecure to all who can reach that address. A map that is not there yet is waited for. Until Ctrl-C.
 
     \b
     factorbus watch warehouse
     factorbus watch warehouse --serve --web-port 9090
-    factorbus watch warehouse --serve --host 192.168.1.20
+    factorbus watch warehouse --serve --host 192.168.1.20 --insecure
     factorbus watch warehouse --save monday.rrd; rerun monday.rrd
     """
     if viewer.save and viewer.serving:
         raise click.UsageError("--save and --serve exclude each other")
+    if not viewer.save:
+        refuse_open_page(viewer.host, viewer.insecure)
     require("watch", "factorbus watch")
     from factorbus.cli.output.console import print_note
     from factorbus.cli.process.bus import joined_when_there, open_bus

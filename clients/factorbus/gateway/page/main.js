@@ -66,6 +66,12 @@ function show(name) {
   map = new LiveMap(name, changed);
 }
 
+function option(row) {
+  const made = element("option", row.problem ? `${row.name} (${row.state})` : row.name);
+  [made.value, made.disabled] = [row.name, Boolean(row.problem)];
+  return made;
+}
+
 function element(tag, text, ...children) {
   const made = document.createElement(tag);
   if (text !== null) made.textContent = text;
@@ -152,9 +158,10 @@ function hands(canvas) {
 async function list() {
   const wanted = decodeURIComponent(location.hash.slice(1));
   try {
-    const { maps } = await ask("/api/maps");
-    of("maps").replaceChildren(...maps.map((row) => element("option", row.name)));
-    if (!maps.length) { of("state").textContent = "there is no map yet"; setTimeout(list, 1000); return; }
+    const rows = (await ask("/api/maps")).maps;
+    of("maps").replaceChildren(...rows.map(option));
+    const maps = rows.filter((row) => !row.problem);  // the others do not open
+    if (!maps.length) { of("state").textContent = rows.length ? "no map opens" : "there is no map yet"; setTimeout(list, 1000); return; }
     const name = maps.some((row) => row.name === wanted) ? wanted : maps[0].name;
     of("maps").value = name;
     show(name);

@@ -47,6 +47,7 @@ _CHANGES_WAIT = "changes of this client are under way, and no more may be"
 # One sender (all clients of one name before its suffix) has at most this share of the names that are remembered.
 _NAMES_OF_ONE = 4
 _NAME_IDLE_S = 10.0
+_LEAVE = "go on under one name instead of new ones, or raise the limit"
 
 
 @dataclass(slots=True)
@@ -250,7 +251,7 @@ class Admission:
         if len(self._clients) >= self._limits.clients:
             name, idlest = min(self._clients.items(), key=lambda item: (bool(item[1].open), item[1].seen))
             if idlest.open or arrived.now - idlest.seen < self._limits.client_idle_s:
-                raise TooLarge("the map", len(self._clients) + 1, self._limits.clients, "clients")
+                raise TooLarge("the map", len(self._clients) + 1, self._limits.clients, "clients", _LEAVE)
             del self._clients[name]
         return _Client(heard=arrived.now)
 
@@ -264,7 +265,7 @@ class Admission:
             return
         name, idlest = min(own.items(), key=lambda item: (bool(item[1].open), item[1].seen))
         if idlest.open or arrived.now - idlest.seen < _NAME_IDLE_S:
-            raise TooLarge(f"{sender} in this map", len(own) + 1, share, "clients")
+            raise TooLarge(f"{sender} in this map", len(own) + 1, share, "clients", _LEAVE)
         del self._clients[name]
 
     def _ask_again(self, insert: Arrived, arrived: Arrived, following: int) -> list[Effect]:

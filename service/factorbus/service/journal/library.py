@@ -5,7 +5,7 @@ import math
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from factorbus.journal.checkpoints import remove_strangers
 from factorbus.journal.folders import GONE, is_map, left_behind, maps_in, sync_folder
 from factorbus.journal.forking import fork_journal
 from factorbus.journal.lock import Owned, own
-from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalOption, NoJournal
+from factorbus.journal.problems import JournalDamaged, JournalOption, NoJournal, NotWritten
 from factorbus.journal.records import Epoch, Header, Maker
 from factorbus.journal.store import NAME, Checkpoint, Last, Store, create, open_store
 from factorbus.proto.nearest import nearest
@@ -74,9 +74,9 @@ class Library:
         for path in left_behind(owned.folder):
             shutil.rmtree(path, ignore_errors=True)
 
-    def names(self) -> list[str]:
-        """The maps that there are."""
-        return maps_in(self._owned.folder, NAME)
+    def names(self, known: Container[str] = ()) -> list[str]:
+        """The maps that there are, without those of the names `known`."""
+        return maps_in(self._owned.folder, NAME, known)
 
     def has(self, name: str) -> bool:
         """Whether there is a map of this name."""
@@ -138,7 +138,7 @@ class Library:
             raise
 
     def remove(self, name: str) -> None:
-        """Forget map `name`, which is closed: first its name, in one go, then its files.  Raises JournalFailed."""
+        """Forget map `name`, which is closed: first its name, in one go, then its files.  Raises NotWritten."""
         path = self._owned.folder / name
         gone = self._owned.folder / f"{GONE}{name}-{secrets.token_hex(4)}"
         try:
@@ -146,7 +146,7 @@ class Library:
             sync_folder(self._owned.folder)
             shutil.rmtree(gone)
         except OSError as error:
-            raise JournalFailed(path, str(error)) from None
+            raise NotWritten(path, str(error), "what is on disk of the map stays") from None
 
     def say(self, text: str) -> None:
         """Tell other processes that want the folder who has it."""
@@ -207,13 +207,13 @@ class Kept:
 def open_library(config: Config, waiting: Callable[[str], None], stop: Any) -> Library | None:
     """The library that `config` names, owned by this process; None if `stop` was set while standing by.
 
-    Raises JournalInUse, UnsafeJournal, JournalFailed.
+    Raises JournalInUse, UnsafeJournal, NotWritten.
     """
     folder = Path(config.journal)
     try:
         owned = own(folder, stop if config.standby else None, waiting)
     except OSError as error:
-        raise JournalFailed(folder, str(error)) from None
+        raise NotWritten(folder, str(error), "the service does not start") from None
     return Library(owned, config) if owned is not None else None
 
 

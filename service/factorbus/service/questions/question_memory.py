@@ -52,4 +52,4 @@ class Room:
     def fits(self, what: str, size: int) -> None:
         """Could a client receive an answer of `size` bytes?  Raises TooLarge."""
         if size > self.answer_bytes:
-            raise TooLarge(what, size, self.answer_bytes, "bytes")
+            raise TooLarge(what, size, self.answer_bytes, "bytes", "ask for less at a time, or raise the limit")

@@ -27,6 +27,7 @@ from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.relative import relative
 from factorbus.solver.covariance.square_root import SquareRoot
 from factorbus.solver.covariance.why import why_factor, why_variable
+from factorbus.solver.errors import UnknownVariable
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 from factorbus.solver.kernels.model import layout as at
@@ -70,13 +71,13 @@ class MissingVariables(Problem):
 
     code = "unknown_variable"
 
-    def __init__(self, keys: Iterable[int]) -> None:
+    def __init__(self, keys: Iterable[int], candidate: str = "") -> None:
+        """candidate: the factor that might be inserted, and is on it."""
         missing = [int(key) for key in keys]
         names = ", ".join(map(format_symbol, missing[:5]))
         shown = names + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
-        super().__init__(
-            f"the map has no {shown}; ask without keys for all there are", key=missing[0], keys=missing[:100]
-        )
+        seen = f"{candidate}: there is no variable {shown}" if candidate else f"the map has no {shown}"
+        super().__init__(f"{seen}; the map's estimate has those there are", key=missing[0], keys=missing[:100])
 
 
 class NoPose(Problem):
@@ -206,7 +207,10 @@ class Uncertain:
         _check_size("the question", count, _MOST, "candidates")
         self._afford(costs.of_candidates(self._blocks, count, numbers), taken)
         plain = [Factors(group.kind, group.keys, group.measured, group.information) for group in factors]
-        return evaluate_candidates(self._blocks, plain)
+        try:
+            return evaluate_candidates(self._blocks, plain)
+        except UnknownVariable as unknown:
+            raise MissingVariables([unknown.key], unknown.factor) from None
 
     def _afford(self, cost: costs.Cost, taken: Taken) -> None:
         """Raises TooLarge, OutOfMemory."""
@@ -269,7 +273,7 @@ def check_keys(ask: Any, room: Room) -> None:
 
 def _check_size(what: str, count: int, most: int, unit: str) -> None:
     if count > most:
-        raise TooLarge(what, count, most, unit)
+        raise TooLarge(what, count, most, unit, "ask for less at a time")
 
 
 _ANSWER: Mapping[type, Callable[[Uncertain, Any, Taken], bytes]] = {

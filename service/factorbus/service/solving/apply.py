@@ -48,6 +48,7 @@ from factorbus.solver.kernels.jit.compile import I64
 GOES_ON = "the map goes on converging, without an insert"
 
 _NOTHING: Mapping[str, int] = {}
+_FULL = "go on in another map, or raise the limit"
 
 log = logging.getLogger(__name__)
 
@@ -264,9 +265,9 @@ class MapSolver(Holding):
         """How many variables and factors the map has with these.  Raises TooLarge beyond its limits."""
         limits, with_them = self._limits, (held[0] + variables, held[1] + factors)
         if with_them[0] > limits.variables:
-            raise TooLarge("the map with this insert", with_them[0], limits.variables, "variables")
+            raise TooLarge("the map with this insert", with_them[0], limits.variables, "variables", _FULL)
         if with_them[1] > limits.factors:
-            raise TooLarge("the map with this insert", with_them[1], limits.factors, "factors")
+            raise TooLarge("the map with this insert", with_them[1], limits.factors, "factors", _FULL)
         return with_them
 
     def _account_of(self, report: Any, started: float, counted: Mapping[str, int] = _NOTHING) -> dict[str, Any]:
