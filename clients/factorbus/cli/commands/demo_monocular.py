@@ -92,9 +92,9 @@ def run_monocular_demo(
     truth = [frame.pose[:3] for frame in world]
     result = {**verdict(seen, evaluator), "points": points, "seed": seed, "workers": workers, "plot": str(plot)}
     shares = [history.share for _, history in evaluator.ended]
-    frames = [(f.number, f.position, f.rays, f.spread) for f in seen]
+    shown = [(f.number, f.position, f.rays, f.spread) for f in seen]
     with output_file(plot):
-        save_monocular_drive(plot, frames, truth, world.points, shares, _said(result))
+        save_monocular_drive(plot, shown, truth, world.points, shares, _said(result))
     return result
 
 
