@@ -37,7 +37,9 @@ def found(text: str) -> str:
 def _ends(kind: FactorKind) -> str:
     poses = [VARIABLE_KINDS[end].is_pose for end in kind.connects]
     letters = ["x₁", "x₂"]
-    if len(poses) == 1:
+    if kind.mounted:
+        letters = ["a", "b" if all(poses) else "l", "m"]
+    elif len(poses) == 1:
         letters = ["x"]
     elif not kind.name.startswith("linear_") and all(poses):
         letters = ["a", "b"]

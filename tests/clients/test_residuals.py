@@ -1,18 +1,35 @@
 """Residuals for colouring: those of the dense twins, and in sum those of the solver."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from naive.dense_factors import residual
 from naive.random_graphs import random_steps
+from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
 
 from factorbus.cli.driving.columns import merged
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
-from factorbus.proto.messages import Factors, Variables
+from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver
 from factorbus.viz.residuals import Values, chi2_of_factors
 
-WORLDS = [(random_steps, 1), (random_steps, 2), (random_steps, 3), (other_steps, 1), (other_steps, 2)]
+
+def sensor_steps(seed: int) -> Iterator[Batch]:
+    """What sensors see whose mount is estimated, but for what has a lens."""
+    for batch in mount_steps(seed):
+        yield Batch(batch.variables, tuple(group for group in batch.factors if group.kind != "point_seen_mount"))
+
+
+WORLDS = [
+    (random_steps, 1),
+    (random_steps, 2),
+    (random_steps, 3),
+    (other_steps, 1),
+    (other_steps, 2),
+    (sensor_steps, 1),
+]
 
 
 @pytest.mark.parametrize(("steps", "seed"), WORLDS)
@@ -42,7 +59,8 @@ def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(steps
 
 def test_the_graphs_above_have_every_kind_but_sights() -> None:
     kinds = {group.kind for steps, seed in WORLDS for step in steps(seed) for group in step.factors}
-    assert kinds == set(FACTOR_KINDS) - {"idp_first", "idp_seen", "point_seen"}  # a lens is more than colours need
+    lenses = {"idp_first", "idp_seen", "point_seen", "point_seen_mount"}  # more than colours need
+    assert kinds == set(FACTOR_KINDS) - lenses
 
 
 def test_what_has_no_value_or_an_unknown_kind_is_nan_and_not_an_error() -> None:

@@ -49,6 +49,8 @@ def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
 
 def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     """r of a kind of factor at the values of its variables.  Raises KeyError: it has no twin yet."""
+    if kind.endswith("_mount"):
+        return residual(kind.removesuffix("_mount"), sensors(ends), z)
     if kind in ("idp_first", "idp_seen", "point_seen"):
         return _sight(kind, *ends, z)
     if kind.startswith("linear"):
@@ -67,6 +69,12 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     if kind.startswith(("landmark", "range", "bearing")):
         return _of_a_point(kind, *ends, z)
     raise KeyError(f"the kind {kind!r} has no dense twin; write its residual here")
+
+
+def sensors(ends: list[np.ndarray]) -> list[np.ndarray]:
+    """Of poses, or a pose and a point, and a mount last: the poses of the sensor there, or one and the point."""
+    *others, mount = ends
+    return [pose_vector(pose_matrix(end) @ pose_matrix(mount)) if len(end) == len(mount) else end for end in others]
 
 
 def _of_a_point(kind: str, pose: np.ndarray, point: np.ndarray, z: np.ndarray) -> np.ndarray:

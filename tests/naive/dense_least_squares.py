@@ -41,6 +41,10 @@ CONNECTS = {
     "linear_pair_se3_idp": ["se3", "idp"],
     "linear_pair_point3_idp": ["point3", "idp"],
 }
+# Of a sensor whose mount is estimated: the mount last.
+_WITH_MOUNT = ("between_se2", "between_se3", "landmark_se2", "landmark_se3", "bearing_range_se2", "bearing_se2")
+_WITH_MOUNT += ("bearing_se3", "range_se2", "range_se3", "point_seen")
+CONNECTS |= {f"{kind}_mount": [*CONNECTS[kind], CONNECTS[kind][0]] for kind in _WITH_MOUNT}
 
 
 class DenseGraph:

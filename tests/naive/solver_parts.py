@@ -18,6 +18,11 @@ def graph_in(solver: Solver) -> FactorGraph:
     return solver._graph
 
 
+def row_count(solver: Solver) -> int:
+    """Rows of its factors; those of more than two variables have several."""
+    return int(solver._graph.counts[at.FACTORS])
+
+
 def system_in(solver: Solver) -> System[Incremental]:
     """The normal equations of a solver that has not the mode "bayes-tree", with their factor."""
     assert isinstance(solver._stepper, IncrementalSteps)

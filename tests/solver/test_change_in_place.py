@@ -8,8 +8,9 @@ import pytest
 from naive.dense_least_squares import DenseGraph
 from naive.estimates import apart, values
 from naive.random_graphs import camera_steps, random_steps
+from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
-from naive.solver_parts import graph_in
+from naive.solver_parts import graph_in, row_count
 from naive.tree_records import stays_at_linearization, tree_of
 from naive.tree_solution import assert_is_solution, normal_equations
 
@@ -20,6 +21,7 @@ from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor
 from factorbus.solver.divergence import copied
+from factorbus.solver.graph.factor_rows import is_first, losses_of
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import BOUNDED, LINEAR
@@ -29,6 +31,8 @@ WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "camera": lambda seed: camera_steps(seed),
     "robust camera": lambda seed: camera_steps(seed, loss="huber"),
     "others": lambda seed: other_steps(seed),
+    "mounts": lambda seed: mount_steps(seed),
+    "robust mounts": lambda seed: mount_steps(seed, loss="dcs"),
 }
 
 
@@ -63,14 +67,14 @@ def twin_of(solver: Solver) -> DenseGraph:
 
 def assert_is_whole(solver: Solver, chi2: float) -> None:
     """χ², what is kept of each factor and variable, R and covariances are those of the factors that are left."""
-    tree, graph, count = tree_of(solver), graph_in(solver), solver.factor_count
+    tree, graph, count = tree_of(solver), graph_in(solver), row_count(solver)
     wanted = twin_of(solver).chi2()
     assert chi2 == pytest.approx(wanted, rel=1e-9, abs=1e-12)
     assert solver.chi2() == pytest.approx(wanted, rel=1e-9, abs=1e-12)
     assert tree.factor_errors[:count, tl.E_CHI2].sum() == pytest.approx(wanted, rel=1e-9, abs=1e-12)
     assert tree.state[tl.S_FACTORS] == tree.state[tl.S_TAKEN] == count
     assert tree.state[tl.S_EXACT] == np.count_nonzero(tree.link[:count, tl.L_KIND] >= tl.EXACT)
-    robust = graph.fac[:count, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS
+    robust = losses_of(graph.fac[:count]) != at.NO_LOSS
     exact = robust | (~BOUNDED[graph.fac[:count, at.F_KIND]])
     assert ((tree.link[:count, tl.L_KIND] >= tl.EXACT) == exact).all()
     ends = graph.fac[:count, [at.F_I, at.F_J]]
@@ -102,8 +106,8 @@ def assert_is_said(problem: errors.SolverError, wanted: str) -> None:
 
 def random_change(solver: Solver, rng: np.random.Generator, weighed: list[Change]) -> list[Change]:
     """One to three changes of factors; `weighed` are those of weights, which may be taken back."""
-    fac = graph_in(solver).fac[: solver.factor_count]
-    able = np.flatnonzero(~LINEAR[fac[:, at.F_KIND]])
+    fac = graph_in(solver).fac[: row_count(solver)]
+    able = np.flatnonzero(~LINEAR[fac[:, at.F_KIND]] & is_first(fac))
     changes: list[Change] = []
     for _ in range(int(rng.integers(1, 4))):
         rows = rng.choice(able, size=min(int(rng.integers(1, 4)), able.size), replace=False)

@@ -59,6 +59,15 @@ class Certainty(TypedDict, total=False):
     loss: tuple[str, float] | str | None
 
 
+class SensorCertainty(Certainty, total=False):
+    """The same of what a sensor measures that is not in the robot's middle.
+
+    mount: the key of a pose in the robot's frame, where the sensor is on it: a variable, to be found out or fixed.
+    """
+
+    mount: str | int | None
+
+
 class FeatureCertainty(TypedDict, total=False):
     """How certain the first observation of an inverse-depth feature is.
 
@@ -86,7 +95,7 @@ def feature_sigmas(where: str, certainty: FeatureCertainty) -> list[float]:
 
 def triangle_of(where: str, dim: int, certainty: Certainty, kind: str = "") -> F64:
     """The upper triangle of Ω, dim × dim, of a factor of `kind`.  Raises BadShape, BadInformation."""
-    _check_names(where, certainty)
+    check_names(where, certainty)
     sigmas, information = certainty.get("sigmas"), certainty.get("information")
     if sigmas is not None and information is None:
         return _from_sigmas(where, dim, np.atleast_1d(as_numbers(f"{where}: sigmas", sigmas)), kind)
@@ -134,9 +143,9 @@ def _parts(where: str, loss: object) -> tuple[object, object]:
     return loss[0], loss[1]
 
 
-def _check_names(where: str, certainty: Mapping[str, object]) -> None:
-    """A misspelt keyword must not be a loss or a weight ignored."""
-    wanted = tuple(Certainty.__annotations__)
+def check_names(where: str, certainty: Mapping[str, object], of: type = Certainty) -> None:
+    """A misspelt keyword must not be a loss or a weight ignored.  Raises BadInformation: `of` has no such keyword."""
+    wanted = tuple(of.__annotations__)
     for name in certainty:
         if name not in wanted:
             meant = f"; did you mean {_ELSEWHERE[name]!r}?" if name in _ELSEWHERE else nearest(name, wanted)

@@ -6,7 +6,7 @@ Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.0
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias, TypedDict, TypeVar, Unpack
+from typing import TypeAlias, TypedDict, TypeVar, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,8 @@ from factorbus.client.arguments import all_finite, as_numbers, checked_flag, che
 from factorbus.client.certainty import (
     Certainty,
     FeatureCertainty,
+    SensorCertainty,
+    check_names,
     feature_sigmas,
     loss_of,
     transform_certainty,
@@ -104,7 +106,7 @@ class Draft:
         second: Key,
         measured: ArrayLike,
         *,
-        mount: ArrayLike | None = None,
+        mount: Key | ArrayLike | None = None,
         **certainty: Unpack[Certainty],
     ) -> Draft:
         """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures.
@@ -112,12 +114,14 @@ class Draft:
         mount: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
         off the centre moves sideways when the robot turns.  The certainty is that of the sensor, in its frame, and is
         carried over to first order in the error (`factorbus.client.lever_arm`, MATH §3.7).
+        Or the key of an se2 that is estimated: the mount is to be found out (MATH §3.9).
         """
-        if mount is not None:
+        if mount is not None and not isinstance(mount, str | int):
             where = self._joins(first, second, "between_se2")
             measured, A = transform_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
             certainty = transform_certainty(where, 3, certainty, A, "between_se2")
-        return self.factor("between_se2", (first, second), measured, **certainty)
+            mount = None
+        return self._at_mount("between_se2", (first, second), mount, measured, certainty)
 
     def between_se3(
         self,
@@ -125,7 +129,7 @@ class Draft:
         second: Key,
         measured: ArrayLike,
         *,
-        mount: ArrayLike | None = None,
+        mount: Key | ArrayLike | None = None,
         **certainty: Unpack[Certainty],
     ) -> Draft:
         """The second pose in the first one's frame: x y z (metres), qx qy qz qw.
@@ -133,45 +137,31 @@ class Draft:
         Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
         g2o: 4/s² for s radians.
 
-        mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; as in `between_se2`.
+        mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; or the key of an
+        se3.  As in `between_se2`.
         """
-        if mount is not None:
+        if mount is not None and not isinstance(mount, str | int):
             where = self._joins(first, second, "between_se3")
             measured, A = transform_se3(
                 where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7)
             )
             certainty = transform_certainty(where, 6, certainty, A, "between_se3")
-        return self.factor("between_se3", (first, second), measured, **certainty)
+            mount = None
+        return self._at_mount("between_se3", (first, second), mount, measured, certainty)
 
-    def landmark_se2(
-        self,
-        pose: Key,
-        point: Key,
-        measured: ArrayLike,
-        **certainty: Unpack[Certainty],
-    ) -> Draft:
+    def landmark_se2(self, pose: Key, point: Key, measured: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """A point2 in the pose's frame: x y (metres)."""
-        return self.factor("landmark_se2", (pose, point), measured, **certainty)
+        return self._seen("landmark_se2", (pose, point), measured, certainty)
 
-    def landmark_se3(
-        self,
-        pose: Key,
-        point: Key,
-        measured: ArrayLike,
-        **certainty: Unpack[Certainty],
-    ) -> Draft:
+    def landmark_se3(self, pose: Key, point: Key, measured: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """A point3 in the pose's frame: x y z (metres)."""
-        return self.factor("landmark_se3", (pose, point), measured, **certainty)
+        return self._seen("landmark_se3", (pose, point), measured, certainty)
 
     def bearing_range_se2(
-        self,
-        pose: Key,
-        point: Key,
-        measured: ArrayLike,
-        **certainty: Unpack[Certainty],
+        self, pose: Key, point: Key, measured: ArrayLike, **certainty: Unpack[SensorCertainty]
     ) -> Draft:
         """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
-        return self.factor("bearing_range_se2", (pose, point), measured, **certainty)
+        return self._seen("bearing_range_se2", (pose, point), measured, certainty)
 
     def position_se2(
         self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0), **certainty: Unpack[Certainty]
@@ -200,13 +190,13 @@ class Draft:
         both = [*_row("seen", seen, 3), *_row("direction", direction, 3)]
         return self.factor("attitude_se3", (key,), both, **certainty)
 
-    def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
+    def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """How far a point2 is from the pose (metres)."""
-        return self.factor("range_se2", (pose, point), [distance], **certainty)
+        return self._seen("range_se2", (pose, point), [distance], certainty)
 
-    def range_se3(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
+    def range_se3(self, pose: Key, point: Key, distance: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """How far a point3 is from the pose (metres)."""
-        return self.factor("range_se3", (pose, point), [distance], **certainty)
+        return self._seen("range_se3", (pose, point), [distance], certainty)
 
     def range_between_se2(self, first: Key, second: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
         """How far two poses in the plane are apart (metres): robots, or a robot and an anchor with an orientation."""
@@ -216,13 +206,13 @@ class Draft:
         """How far two poses in space are apart (metres)."""
         return self.factor("range_between_se3", (first, second), [distance], **certainty)
 
-    def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[Certainty]) -> Draft:
+    def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """Where a point2 is to be seen from the pose (radians, from the x axis to the left)."""
-        return self.factor("bearing_se2", (pose, point), [bearing], **certainty)
+        return self._seen("bearing_se2", (pose, point), [bearing], certainty)
 
-    def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
+    def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """Where a point3 is to be seen from the pose: a vector of any length in its frame; sigmas: nearly radians."""
-        return self.factor("bearing_se3", (pose, point), _row("direction", direction, 3), **certainty)
+        return self._seen("bearing_se3", (pose, point), _row("direction", direction, 3), certainty)
 
     def linear(
         self,
@@ -273,10 +263,16 @@ class Draft:
         return self.factor("idp_seen", (pose, feature), [*_row("pixel", pixel, 2), *_lens(camera)], **certainty)
 
     def point_seen(
-        self, pose: Key, point: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
+        self,
+        pose: Key,
+        point: Key,
+        camera: Camera,
+        pixel: ArrayLike,
+        **certainty: Unpack[SensorCertainty],
     ) -> Draft:
         """A point3 seen by the pose's camera: u v (pixels)."""
-        return self.factor("point_seen", (pose, point), [*_row("pixel", pixel, 2), *_lens(camera)], **certainty)
+        measured = [*_row("pixel", pixel, 2), *_lens(camera)]
+        return self._seen("point_seen", (pose, point), measured, certainty)
 
     def variable(
         self,
@@ -322,6 +318,20 @@ class Draft:
         all_measured.append(row)
         all_triangles.append(triangle)
         return self
+
+    def _seen(self, kind: str, keys: tuple[Key, Key], measured: ArrayLike, certainty: SensorCertainty) -> Draft:
+        """What a sensor measures that may have a mount."""
+        check_names(self._joins(*keys, kind), certainty, SensorCertainty)
+        rest = {name: value for name, value in certainty.items() if name != "mount"}
+        return self._at_mount(kind, keys, certainty.get("mount"), measured, cast("Certainty", rest))
+
+    def _at_mount(
+        self, kind: str, keys: tuple[Key, Key], mount: Key | None, measured: ArrayLike, certainty: Certainty
+    ) -> Draft:
+        """A factor of this kind, or where there is a mount the one whose last variable that is."""
+        if mount is None:
+            return self.factor(kind, keys, measured, **certainty)
+        return self.factor(f"{kind}_mount", (*keys, mount), measured, **certainty)
 
     def _joins(self, first: Key, second: Key, kind: str) -> str:
         """What an error says it is about."""

@@ -24,6 +24,7 @@ from factorbus.client.frames import (
     inverse,
     moved_values,
 )
+from factorbus.client.mounts import rows_of_group, split_mounts
 from factorbus.client.transform_factors import transform_factors
 from factorbus.client.transform_linear import are_relative, says_nothing
 from factorbus.proto.arrays import F64, I64
@@ -126,12 +127,13 @@ def fit_into(
     given = Batch() if anchors is None else batch_of("anchors", anchors)
     size = _size_of(other.batch)
     renamed = _renamed(other.batch, named)
-    _check_keys(here, renamed)
-    _check_ends(given, here, renamed)
+    of_robots, renamed = split_mounts(renamed)
+    _check_keys(here, _together(of_robots, renamed))
+    _check_ends(given, here, _together(of_robots, renamed))
     kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute)
     if absolute == "keep":
         T = np.array([0.0] * size if size == 3 else [0.0] * 6 + [1.0])
-        return Fitted(_together(kept, given), T, {}, given.factor_count)
+        return Fitted(_together(of_robots, _together(kept, given)), T, {}, given.factor_count)
     T = _frame(here, renamed, given, frame, size)
     if not given.factor_count:
         given = _tie(here, renamed, T, sigmas).batch()
@@ -139,7 +141,7 @@ def fit_into(
         tuple(g._replace(values=moved_values(g.kind, _values(g), T)) for g in kept.variables),
         tuple(transform_factors(g, T) for g in kept.factors),
     )
-    return Fitted(_together(moved, given), T, left_out, given.factor_count)
+    return Fitted(_together(of_robots, _together(moved, given)), T, left_out, given.factor_count)
 
 
 def _size_of(batch: Batch) -> int:
@@ -215,12 +217,12 @@ def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:
     factors, pairs, joint = [], [group for group in batch.factors if group.kind in LINEAR_PAIRS], _joint(batch)
     for group in batch.factors:
         if group.kind in LINEAR:
-            group = _rows(group, ~says_nothing(group, pairs))
+            group = rows_of_group(group, ~says_nothing(group, pairs))
         stays = _stays(group, joint)
         if not stays.all():
             held[group.kind] = held.get(group.kind, 0) + int((~stays).sum())
         if stays.any():
-            factors.append(_rows(group, stays))
+            factors.append(rows_of_group(group, stays))
     if absolute == "refuse" and not _is_gauge(batch, held):
         raise AbsoluteFactors(held)
     return Batch(tuple(group._replace(fixed=False) for group in batch.variables), tuple(factors)), held
@@ -244,13 +246,6 @@ def _is_gauge(batch: Batch, held: Mapping[str, int]) -> bool:
         return False
     poses = all(group.kind in ("se2", "se3") for group in batch.variables if group.fixed)
     return poses and all(kind in ("fixed", *_PRIORS) for kind in held)
-
-
-def _rows(group: Factors, chosen: np.ndarray) -> Factors:
-    scale = None if group.scale is None else group.scale[chosen]
-    return group._replace(
-        keys=group.keys[chosen], measured=group.measured[chosen], information=group.information[chosen], scale=scale
-    )
 
 
 def _frame(here: Estimate, renamed: Batch, anchors: Batch, frame: ArrayLike | None, size: int) -> F64:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS, parts_of
 from factorbus.proto.messages import Factors, Variables
 
@@ -139,6 +140,31 @@ def _less_idp(y: F64, x: F64) -> F64:
     return step
 
 
+def _sensor_se2(pose: F64, mount: F64) -> F64:
+    """pose ∘ mount in the plane."""
+    return np.column_stack([pose[:, :2] + _turned_in_plane(pose, mount[:, :2]), pose[:, 2:3] + mount[:, 2:3]])
+
+
+def _sensor_se3(pose: F64, mount: F64) -> F64:
+    """pose ∘ mount in space."""
+    u, w = pose[:, 3:6], pose[:, 6:7]
+    v, s = mount[:, 3:6], mount[:, 6:7]
+    scalar = w * s - np.sum(u * v, axis=1, keepdims=True)
+    place = pose[:, :3] + _turned_in_space(pose, mount[:, :3])
+    return np.column_stack([place, w * v + s * u + np.cross(u, v), scalar])
+
+
+def _at_mount(kind: str) -> Callable[..., F64]:
+    """The residual of a kind with the sensor's poses in place of the robot's; the mount is the last variable."""
+    of, connects = _RESIDUALS[kind], FACTOR_KINDS[kind].connects
+    sensor = _sensor_se2 if connects[0] == "se2" else _sensor_se3
+
+    def residual(first: F64, second: F64, mount: F64, z: F64) -> F64:
+        return of(sensor(first, mount), sensor(second, mount) if connects[1] == connects[0] else second, z)
+
+    return residual
+
+
 # x ⊟ y, as linear factors have it.
 _LESS: Mapping[str, Callable[[F64, F64], F64]] = {
     "se2": _less_se2,
@@ -147,7 +173,7 @@ _LESS: Mapping[str, Callable[[F64, F64], F64]] = {
     "point3": lambda y, x: x[:, :3] - y,
     "idp": _less_idp,
 }
-_RESIDUALS: Mapping[str, Callable[..., F64]] = {
+_RESIDUALS: dict[str, Callable[..., F64]] = {
     "prior_se2": lambda x, z: _less_se2(z, x),
     "prior_se3": lambda x, z: _less_se3(z, x)[:, :6],
     "prior_point2": lambda p, z: p[:, :2] - z,
@@ -168,4 +194,7 @@ _RESIDUALS: Mapping[str, Callable[..., F64]] = {
     "bearing_se2": lambda a, p, z: _bearing_range(a, p, np.column_stack([z, z]))[:, :1],
     "bearing_se3": lambda a, p, z: _unit(_into_space(a, p)) - _unit(z),
     **{kind: _linear(kind) for kind in (*LINEAR, *LINEAR_PAIRS)},
+}
+_RESIDUALS |= {
+    name: _at_mount(kind.mounted) for name, kind in FACTOR_KINDS.items() if kind.mounted and kind.mounted in _RESIDUALS
 }

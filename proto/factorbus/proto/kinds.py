@@ -4,7 +4,7 @@ The mathematics of each kind (residual, Jacobians, ⊞) is the solver's; this ta
 build and read messages, and a test holds the two against each other.  A name never changes its meaning.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +23,10 @@ class FactorKind:
     """One kind of factor: `size` numbers measured, a residual of `dim`, an information matrix dim × dim.
 
     measured, residual: for people, and for the table in proto/README.md.  There the variables are a and b of two poses,
-    l of a point and y of a feature seen from pose a, and x, or x₁ and x₂, of others.  example: a measurement, for the
-    golden message of the kind.  half_angles: the last three rows of the residual are the vector part of a quaternion
+    l of a point and y of a feature seen from pose a, m of a mount, and x, or x₁ and x₂, of others.
+    example: a measurement, for the golden message of the kind
+    half_angles: the last three rows of the residual are the vector part of a quaternion
+    mounted: the kind of which this is the one of a sensor whose mount on the robot, its last variable, is estimated
     """
 
     name: str
@@ -35,6 +37,7 @@ class FactorKind:
     residual: str
     example: tuple[float, ...]
     half_angles: bool = False
+    mounted: str = ""
 
     def __post_init__(self) -> None:
         if len(self.example) != self.size:
@@ -97,9 +100,26 @@ def _linear(*ends: str) -> FactorKind:
     return FactorKind(name, ends, size, rows, measured, "H₁ (x₁ ⊟ y₁) + H₂ (x₂ ⊟ y₂) + b", example)
 
 
-FACTOR_KINDS = {
-    kind.name: kind
-    for kind in (
+def _with_mounts(kinds: tuple[FactorKind, ...]) -> tuple[FactorKind, ...]:
+    """And those of a sensor whose mount is estimated: of all that one pose measures of another, or of a point."""
+    return (*kinds, *(_mounted(kind) for kind in kinds if kind.name in _WITH_MOUNT))
+
+
+_WITH_MOUNT = (
+    *("between_se2", "between_se3", "landmark_se2", "landmark_se3", "bearing_range_se2", "bearing_se2", "bearing_se3"),
+    *("range_se2", "range_se3", "point_seen"),
+)
+
+
+def _mounted(kind: FactorKind) -> FactorKind:
+    """`kind` as measured by a sensor at m on the robot: with a ∘ m in place of the pose a."""
+    instead = "a ∘ m and b ∘ m for a and b" if kind.connects[0] == kind.connects[1] else "a ∘ m for a"
+    ends, residual = (*kind.connects, kind.connects[0]), f"that of {kind.name} with {instead}"
+    return replace(kind, name=f"{kind.name}_mount", connects=ends, residual=residual, mounted=kind.name)
+
+
+_KINDS = _with_mounts(
+    (
         FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
         FactorKind(
             "prior_se3",
@@ -240,7 +260,8 @@ FACTOR_KINDS = {
         *(_linear(kind, kind) for kind in ("se2", "se3", "point2", "point3", "idp")),
         *(_linear(*b) for b in (("se2", "point2"), ("se3", "point3"), ("se3", "idp"), ("point3", "idp"))),
     )
-}
+)
+FACTOR_KINDS = {kind.name: kind for kind in _KINDS}
 
 
 @dataclass(frozen=True, slots=True)

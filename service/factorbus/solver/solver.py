@@ -57,7 +57,7 @@ class Solver:
     @property
     def factor_count(self) -> int:
         """Factors, the staged ones included."""
-        return int(self._graph.counts[at.FACTORS])
+        return self._graph.factor_count
 
     def stage(self, batch: BatchLike | Columns) -> int:
         """Check `batch`, take it in, and give values to its variables that have none; gives the id of its first factor.
@@ -109,7 +109,7 @@ class Solver:
         """Take over the first variables and factors of `other`, as they are; the first step of a new solver."""
         edits = unchanged(other._graph)
         edits.stays[variables:] = False
-        edits.kept[factors:] = False
+        edits.kept[other._graph.rows_of_first(factors) :] = False
         self._graph.take(edited(other._graph, edits))
         return self._stepper.resume(False)
 
@@ -132,7 +132,8 @@ class Solver:
         variables, factors: how many of each at most, the first ones.
         """
         count = self.variable_count if variables is None else min(variables, self.variable_count)
-        return self._graph.variables(np.arange(count)), self._graph.factors(factors, find_apart(self._graph))
+        rows = None if factors is None else self._graph.rows_of_first(factors)
+        return self._graph.variables(np.arange(count)), self._graph.factors(rows, find_apart(self._graph))
 
     def content(self) -> FactorGraph:
         """A copy of everything, as of the last step, for computations elsewhere."""

@@ -116,10 +116,11 @@ class TreeSteps:
         """Bytes in use for the tree."""
         return self._tree.memory_bytes()
 
-    def rebase(self, fewer: int) -> None:
-        """Note that this number of the factors that were there after the last step is gone."""
+    def rebase(self, rows: int, members: int) -> None:
+        """Note that so many rows of factors that were there after the last step are gone, and members among them."""
         mark = list(self._mark)
-        mark[at.FACTORS] -= fewer
+        mark[at.FACTORS] -= rows
+        mark[at.MEMBERS] -= members
         self._mark = tuple(mark)
 
     def forget(self) -> None:
@@ -302,7 +303,7 @@ class TreeSteps:
             chi2,
             max(chi2_before, 0.0),
             now[at.VARIABLES] - before[at.VARIABLES],
-            now[at.FACTORS] - before[at.FACTORS],
+            now[at.FACTORS] - now[at.MEMBERS] - before[at.FACTORS] + before[at.MEMBERS],
             self._moved.size if result else changed,
             relinearized,
             eliminated,

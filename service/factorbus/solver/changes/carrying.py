@@ -6,6 +6,7 @@ A pose that was placed moved by M = x' x⁻¹, and what hangs on it moves by the
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import is_first
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.relations import poses_apart
@@ -23,7 +24,8 @@ def carry_along(graph: FactorGraph, values: F64, placed: np.ndarray, stays: np.n
     """
     values, kind = values.copy(), graph.var[: placed.size, at.V_KIND]
     known = (placed | (graph.var[: placed.size, at.V_COLUMN] < 0)) & stays
-    ends = graph.fac[: kept.size][kept & (graph.fac[: kept.size, at.F_J] >= 0)][:, [at.F_I, at.F_J]]
+    fac = graph.fac[: kept.size]  # of three variables the last is a mount, which is not in the map
+    ends = fac[kept & (fac[:, at.F_J] >= 0) & is_first(fac)][:, [at.F_I, at.F_J]]
     ends = np.concatenate([ends, ends[:, ::-1]])  # (from, to)
     ends = ends[np.argsort(~np.isin(kind[ends[:, 0]], _POSES), kind="stable")]  # a point turns nothing
     while True:

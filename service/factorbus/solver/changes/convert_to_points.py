@@ -9,6 +9,7 @@ import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph, table_size
+from factorbus.solver.graph.factor_rows import losses_of
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.key_table import enter_keys
@@ -85,6 +86,7 @@ def with_points(graph: FactorGraph, features: I64) -> FactorGraph:
     made.table = np.zeros(max(table_size(variables), 64), np.int64)
     enter_keys(variables, made.table, made.keys)
     made.counts[[at.VARIABLES, at.FACTORS, at.VALUES]] = variables, factors, values.size
+    made.counts[at.MEMBERS] = graph.counts[at.MEMBERS]
     made.counts[[at.PAYLOAD, at.COLUMNS, at.SCALARS]] = payload.size, np.count_nonzero(free), dims[free].sum()
     made.stamps, made.counts[at.STAMPED] = graph.stamps[:variables].copy(), graph.counts[at.STAMPED]
     made.ids, made.id_shift = graph.ids, graph.id_shift
@@ -113,8 +115,10 @@ def _payload(graph: FactorGraph, fac: I64, turned: I64) -> F64:
     """The payloads, packed anew; F_KIND and F_AT of `fac` follow."""
     pieces, at_new = [], 0
     for row in fac:
+        if row[at.F_KIND] == at.MEMBER:
+            continue
         kind, p = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])], int(row[at.F_AT])
-        has_loss = row[at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS
+        has_loss = losses_of(row) != at.NO_LOSS
         numbers = graph.payload[p : p + kind.size + kind.triangle + has_loss]
         if row[at.F_J] >= 0 and turned[row[at.F_J]]:
             if kind.code == at.IDP_FIRST:

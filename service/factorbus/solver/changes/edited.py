@@ -7,6 +7,7 @@ import numpy as np
 
 from factorbus.solver.changes.requested import Edits
 from factorbus.solver.graph.factor_graph import FactorGraph, table_size
+from factorbus.solver.graph.factor_rows import is_first, with_losses
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.key_table import enter_keys
@@ -15,8 +16,9 @@ from factorbus.solver.kernels.model import layout as at
 
 _SIZE = np.array([VARIABLE_KIND_OF_CODE[code].size for code in sorted(VARIABLE_KIND_OF_CODE)], np.int64)
 _DIM = np.array([VARIABLE_KIND_OF_CODE[code].dim for code in sorted(VARIABLE_KIND_OF_CODE)], np.int64)
-_MEASURED = np.array([FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)], np.int64)
-_TRIANGLE = np.array([FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)], np.int64)
+# The last is of rows that are not the first of their factors, which have none.
+_MEASURED = np.array([*(FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)), 0], np.int64)
+_TRIANGLE = np.array([*(FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)), 0], np.int64)
 
 
 def edited(graph: FactorGraph, edits: Edits) -> FactorGraph:
@@ -33,6 +35,7 @@ def edited(graph: FactorGraph, edits: Edits) -> FactorGraph:
     enter_keys(stays.size, made.table, made.keys)
     made.counts[[at.VARIABLES, at.FACTORS, at.VALUES]] = stays.size, kept.size, made.values.size
     made.counts[[at.PAYLOAD, at.COLUMNS, at.SCALARS]] = made.payload.size, columns, made.dims[:columns].sum()
+    made.counts[at.MEMBERS] = np.count_nonzero(~is_first(made.fac))
     made.counts[at.STAMPED] = np.count_nonzero(made.stamps != at.NO_STAMP)
     made.name_factors(graph.ids_of(kept), graph.next_id)
     return made
@@ -71,7 +74,8 @@ def _pack_payload(graph: FactorGraph, made: FactorGraph, loss: I64, scale: F64, 
     for row in np.flatnonzero(weight != 1.0).tolist():
         begin = start[row] + measured[row]
         made.payload[begin : begin + triangle[row]] *= weight[row]
-    fac[:, at.F_AT], fac[:, at.F_FLAGS] = start, loss << at.LOSS_SHIFT
+    fac[:, at.F_AT] = start
+    fac[:, at.F_FLAGS] = with_losses(fac[:, at.F_FLAGS] & ~at.SWAPPED, loss)
 
 
 def _renumber_ends(made: FactorGraph, edits: Edits) -> None:

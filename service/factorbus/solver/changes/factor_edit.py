@@ -16,6 +16,7 @@ import numpy as np
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.changes.requested import Edits
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import is_first, losses_of, with_losses
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -62,6 +63,10 @@ class FactorEdit:
         self._graph, self._tree, self._edits = graph, tree, edits
         self.gone: I64 = np.flatnonzero(~edits.kept)
         self.renewed: I64 = np.flatnonzero(edits.kept & edits.touched)
+        first = is_first(graph.fac[: edits.kept.size])
+        # Factors gone and renewed, and the rows gone that are not the first of their factors.
+        self.counts = int(first[self.gone].sum()), int(first[self.renewed].sum())
+        self.members = self.gone.size - self.counts[0]
         self._log: I64 = np.empty((MOST_LINKS * self.gone.size, LOG_WIDTH), np.int64)
         self._linked = 0
         self._closed = False
@@ -85,16 +90,17 @@ class FactorEdit:
         """Change graph and tree, ahead of a step; False: a χ² is beyond numbers, `undo` it."""
         graph, tree = self._graph, self._tree
         self._before = self._remember()
-        for row in self.renewed.tolist():
+        for row in self.renewed[is_first(graph.fac[self.renewed])].tolist():
             self._rewrite(row)
         linked = int(edit_factors(self.gone, self.renewed, graph.array_table, tree.array_table, self._log))
         self._linked = linked if linked >= 0 else -1 - linked
         if self.gone.size:
-            last = max(graph.ids.size, int(self.gone[-1]) + 1)
+            last, following = max(graph.ids.size, int(self.gone[-1]) + 1), graph.next_id
             ids = np.delete(graph.ids_of(np.arange(last)), self.gone)
             graph.holes += int(self._widths(self.gone).sum())
             close_gaps(self.gone, graph.array_table, tree.array_table)
-            graph.ids, graph.id_shift = ids, graph.id_shift + self.gone.size
+            graph.counts[at.MEMBERS] -= self.members
+            graph.name_factors(ids, following)
             self._closed = True
         return linked >= 0
 
@@ -105,7 +111,9 @@ class FactorEdit:
             return
         if self._closed:
             open_gaps(self.gone, graph.array_table, tree.array_table)
+            graph.counts[at.MEMBERS] += self.members
         graph.ids, graph.id_shift, graph.holes = before.ids, before.id_shift, before.holes
+        graph.forget_ids()
         graph.fac[self._rows] = before.fac
         for row, numbers in zip(self.renewed.tolist(), before.weighed, strict=True):
             start = graph.fac[row, at.F_AT]
@@ -146,9 +154,8 @@ class FactorEdit:
             size = VARIABLE_KIND_OF_CODE[kind].dim if scalar >= 0 else 0
             diagonals.append(tree.scalars[1, max(scalar, 0) : max(scalar, 0) + size].copy())
         for row in self.renewed.tolist():
-            kind = FACTOR_KIND_OF_CODE[int(graph.fac[row, at.F_KIND])]
-            dims = [end.dim for end in kind.connects]
-            start, size = int(tree.link[row, tl.L_AT]), hessian_size(dims[0], dims[1] if len(dims) > 1 else 0)
+            dims = [VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])].dim if v >= 0 else 0 for v in _pair(graph, row)]
+            start, size = int(tree.link[row, tl.L_AT]), hessian_size(dims[0], dims[1])
             hessians.append(tree.hessian[start : start + size].copy())
             start = int(graph.fac[row, at.F_AT])
             weighed.append(graph.payload[start : start + int(self._widths(np.array([row]))[0])].copy())
@@ -172,8 +179,8 @@ class FactorEdit:
         """The weight and loss of a factor that stays."""
         graph, edits = self._graph, self._edits
         kind, start = FACTOR_KIND_OF_CODE[int(graph.fac[row, at.F_KIND])], int(graph.fac[row, at.F_AT])
-        flags, loss = int(graph.fac[row, at.F_FLAGS]), int(edits.loss[row])
-        had, width = flags >> at.LOSS_SHIFT != at.NO_LOSS, kind.size + kind.triangle
+        loss = int(edits.loss[row])
+        had, width = bool(losses_of(graph.fac[row]) != at.NO_LOSS), kind.size + kind.triangle
         if loss != at.NO_LOSS and not had:
             graph.reserve_factors(1, width + 1)
             end = int(graph.counts[at.PAYLOAD])
@@ -188,10 +195,15 @@ class FactorEdit:
             graph.payload[start + width] = edits.scale[row]
         if edits.weight[row] != 1.0:
             graph.payload[start + kind.size : start + width] *= edits.weight[row]
-        graph.fac[row, at.F_FLAGS] = (flags & ((1 << at.LOSS_SHIFT) - 1)) + (loss << at.LOSS_SHIFT)
+        graph.fac[row, at.F_FLAGS] = with_losses(graph.fac[row, at.F_FLAGS], loss)
 
     def _widths(self, rows: I64) -> I64:
         """How many numbers of the payload each of these factors has."""
-        kinds = [FACTOR_KIND_OF_CODE[code] for code in self._graph.fac[rows, at.F_KIND].tolist()]
-        robust = self._graph.fac[rows, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS
-        return np.array([kind.size + kind.triangle for kind in kinds], np.int64) + robust
+        kinds = [FACTOR_KIND_OF_CODE.get(code) for code in self._graph.fac[rows, at.F_KIND].tolist()]
+        robust = losses_of(self._graph.fac[rows]) != at.NO_LOSS
+        return np.array([kind.size + kind.triangle if kind else 0 for kind in kinds], np.int64) + robust
+
+
+def _pair(graph: FactorGraph, row: int) -> list[int]:
+    """The variables that a row joins; −1: no second one."""
+    return graph.fac[row, at.F_I : at.F_J + 1].tolist()

@@ -30,8 +30,8 @@ def try_in_place(
     if not edit.is_possible:
         return None
     first = stage()
-    count = edit.gone.size
-    steps.rebase(count)
+    count = edit.gone.size, edit.members
+    steps.rebase(*count)
     try:
         if edit.make():
             report = steps.step(settle=False)
@@ -50,10 +50,10 @@ def try_in_place(
     return None
 
 
-def _take_back(steps: TreeSteps, edit: FactorEdit, count: int) -> None:
+def _take_back(steps: TreeSteps, edit: FactorEdit, count: tuple[int, int]) -> None:
     steps.forget()
     edit.undo()
-    steps.rebase(-count)
+    steps.rebase(-count[0], -count[1])
 
 
 def _is_sound(graph: FactorGraph, steps: TreeSteps, report: StepReport) -> bool:
@@ -63,5 +63,5 @@ def _is_sound(graph: FactorGraph, steps: TreeSteps, report: StepReport) -> bool:
 
 
 def _told(edit: FactorEdit) -> str:
-    parts = [(edit.gone.size, "removed"), (edit.renewed.size, "with another weight or loss")]
+    parts = [(edit.counts[0], "removed"), (edit.counts[1], "with another weight or loss")]
     return ", ".join(f"{counted(count, 'factor')} {what}" for count, what in parts if count)

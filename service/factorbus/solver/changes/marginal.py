@@ -10,13 +10,15 @@ import numpy as np
 from factorbus.pieces import MOST, as_pieces, cut
 from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import is_first, of_whole_factors
 from factorbus.solver.graph.groups import FactorGroup
 from factorbus.solver.graph.joints import find_joints
 from factorbus.solver.graph.quadratic import Quadratic, kind_of, quadratic
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
-# Below this share of the largest eigenvalue a direction of the border is not known at all.
+# Below this share of the largest eigenvalue a direction of the border is not known at all, nor is a scalar of which no
+# more than this share is left of what was known of it.
 _NOTHING = 1e-13
 
 
@@ -52,13 +54,13 @@ def _pieces(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[list[
             v = above[v]
         return v
 
-    ends = graph.fac[: kept.size, at.F_I : at.F_J + 1]
+    fac = graph.fac[: kept.size]
     groups = [
         (joint.variables, joint.rows) for joint in find_joints(graph, kept) if not going.isdisjoint(joint.variables)
     ]
     joined = {f for _, rows in groups for f in rows}
-    on = np.flatnonzero(kept & np.isin(ends, gone).any(axis=1)).tolist()
-    groups += [([v for v in ends[f].tolist() if v >= 0], [f]) for f in on if f not in joined]
+    on = of_whole_factors(fac, kept & np.isin(fac[:, at.F_I : at.F_J + 1], gone).any(axis=1)) & is_first(fac)
+    groups += [(graph.ends_of(f), [f]) for f in np.flatnonzero(on).tolist() if f not in joined]
     for of, _ in groups:
         inside = [v for v in of if v in free]
         for v in inside[1:]:
@@ -77,8 +79,7 @@ def _pieces(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[list[
 
 def _check_border(graph: FactorGraph, part: list[int], rows: list[int], gone: I64) -> None:
     """Before anything is computed of it.  Raises TooConnected."""
-    ends = np.unique(graph.fac[rows, at.F_I : at.F_J + 1])
-    ends = np.setdiff1d(ends[ends >= 0], gone)
+    ends = np.setdiff1d([v for row in rows for v in graph.ends_of(row)], gone).astype(np.int64)
     border = ends[graph.var[ends, at.V_COLUMN] >= 0]
     if border.size > MOST:
         raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[border].tolist(), MOST)
@@ -98,7 +99,11 @@ def _reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64
             key, factors, "its own factors leave it free; it cannot be marginalized"
         ) from None
     across, along = np.linalg.solve(L, cross), np.linalg.solve(L, whole.eta[:cut])
-    return whole.information[cut:, cut:] - across.T @ across, whole.eta[cut:] - across.T @ along
+    information, eta = whole.information[cut:, cut:] - across.T @ across, whole.eta[cut:] - across.T @ along
+    # Of a scalar that is known only with what goes, nothing is left but rounding.
+    nothing = information.diagonal() <= _NOTHING * whole.information.diagonal()[cut:]
+    information[nothing], information[:, nothing], eta[nothing] = 0.0, 0.0, 0.0
+    return information, eta
 
 
 def _as_factors(graph: FactorGraph, border: list[int], information: F64, eta: F64) -> list[FactorGroup]:

@@ -21,6 +21,7 @@ from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import is_first, rows_of_factors
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.groups import Group
 from factorbus.solver.graph.joints import find_joints
@@ -98,7 +99,9 @@ def find_loops(graph: FactorGraph) -> I64:
     for v in np.flatnonzero(graph.var[:count, at.V_COLUMN] < 0).tolist():
         above[v] = count  # the ground
     loops = []
-    for f, (i, j) in enumerate(graph.fac[: graph.counts[at.FACTORS], at.F_I : at.F_J + 1].tolist()):
+    fac = graph.fac[: graph.counts[at.FACTORS]]
+    for f in np.flatnonzero(is_first(fac)).tolist():  # the first row of three variables is without the mount
+        i, j = fac[f, at.F_I : at.F_J + 1].tolist()
         if j < 0:
             continue
         first, second = _root(above, i), _root(above, j)
@@ -134,7 +137,7 @@ def _beginnings(graph: FactorGraph, rows: I64) -> Iterable[F64]:
     """The present values, and those that the trusted factors compose if they reach everything."""
     yield graph.values
     trusted = np.ones(int(graph.counts[at.FACTORS]), bool)
-    trusted[rows] = False
+    trusted[rows_of_factors(graph.fac, rows)] = False
     composed = copy(graph)
     composed.fac, composed.values = graph.fac[: trusted.size][trusted], graph.values.copy()
     reached = (graph.var[: graph.counts[at.VARIABLES], at.V_COLUMN] < 0).astype(np.int64)

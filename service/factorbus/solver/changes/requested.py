@@ -27,6 +27,7 @@ from factorbus.solver.changes.carrying import carry_along
 from factorbus.solver.changes.marginal import marginals
 from factorbus.solver.graph.admission import out_of_bounds
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import is_first, losses_of, of_whole_factors, rows_of_factors
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSSES
 from factorbus.solver.graph.groups import FactorGroup
 from factorbus.solver.graph.joints import check_kept
@@ -40,7 +41,7 @@ CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free",
 _BEFORE_MARGINALIZE = {"remove_factors", "remove_variables"}
 _NONE = np.empty(0, np.int64)
 # Numbers of a measurement and its information, by the code of the kind.
-_WIDTH = np.array([k.size + k.triangle for _, k in sorted(FACTOR_KIND_OF_CODE.items())], np.int64)
+_WIDTH = np.array([*(k.size + k.triangle for _, k in sorted(FACTOR_KIND_OF_CODE.items())), 0], np.int64)
 _QUATERNION_TOLERANCE = 1e-3
 _WEIGHTS = (1e-12, 1e12)  # beyond, a factor holds nothing, or nothing else does
 
@@ -72,7 +73,7 @@ class ChangeLike(Protocol):
 
 @dataclass(slots=True)
 class Edits:
-    """What is to become of each variable (n,) and each factor (m,) of a graph.
+    """What is to become of each variable (n,) and each row of factors (m,) of a graph; rows of one factor alike.
 
     stays, kept: whether it is there afterwards   free: whether a variable is estimated
     loss, scale: code of the loss and its scale   weight: what Ω is multiplied by   values: as in the graph
@@ -114,10 +115,11 @@ def collect(graph: FactorGraph, changes: Sequence[ChangeLike]) -> Edits:
     if edits.carry:
         edits.values = carry_along(graph, edits.values, edits.placed, edits.stays, edits.kept)
     check_kept(graph, edits.kept & (edits.loss == at.NO_LOSS))  # what gets a loss leaves the others as well
+    first = is_first(graph.fac[: edits.kept.size])
     edits.counted = {
         "removed_variables": int(np.count_nonzero(~edits.stays)),
-        "removed_factors": int(np.count_nonzero(~edits.kept)),
-        "edited_factors": int(np.count_nonzero(edits.touched & edits.kept)),
+        "removed_factors": int(np.count_nonzero(~edits.kept & first)),
+        "edited_factors": int(np.count_nonzero(edits.touched & edits.kept & first)),
         "fixed_variables": int(np.count_nonzero(edits.stays & before & ~edits.free)),
         "freed_variables": int(np.count_nonzero(edits.stays & ~before & edits.free)),
         "placed_variables": int(np.count_nonzero(edits.placed)),
@@ -130,7 +132,7 @@ def unchanged(graph: FactorGraph) -> Edits:
     """Everything as it is."""
     variables, factors = int(graph.counts[at.VARIABLES]), int(graph.counts[at.FACTORS])
     fac, var = graph.fac[:factors], graph.var[:variables]
-    loss = fac[:, at.F_FLAGS] >> at.LOSS_SHIFT
+    loss = losses_of(fac)
     scale = np.zeros(factors)
     robust = np.flatnonzero(loss != at.NO_LOSS)
     scale[robust] = graph.payload[fac[robust, at.F_AT] + _WIDTH[fac[robust, at.F_KIND]]]
@@ -148,7 +150,7 @@ def unchanged(graph: FactorGraph) -> Edits:
 
 
 def _remove_factors(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
-    edits.kept[_factors(graph, edits, change)] = False
+    edits.kept[rows_of_factors(graph.fac, _factors(graph, edits, change))] = False
 
 
 def _remove_variables(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
@@ -156,11 +158,12 @@ def _remove_variables(graph: FactorGraph, edits: Edits, change: ChangeLike) -> N
     edits.stays[gone] = False
     fac = graph.fac[: edits.kept.size]
     left = edits.stays[fac[:, at.F_I]] & ((fac[:, at.F_J] < 0) | edits.stays[fac[:, at.F_J]])
-    if change.alone and (on_them := np.flatnonzero(edits.kept & ~left)).size:
-        row = on_them[0]
-        end = at.F_I if not edits.stays[fac[row, at.F_I]] else at.F_J
-        key, factor = int(graph.keys[fac[row, end]]), int(graph.ids_of(on_them[:1])[0])
-        raise errors.InUse(key, factor, graph.describe(fac[row]), on_them.size)
+    left = ~of_whole_factors(fac, ~left)
+    if change.alone and (on_them := np.flatnonzero(edits.kept & ~left & is_first(fac))).size:
+        row = int(on_them[0])
+        end = next(v for v in graph.ends_of(row) if not edits.stays[v])
+        key, factor = int(graph.keys[end]), int(graph.ids_of(on_them[:1])[0])
+        raise errors.InUse(key, factor, graph.describe(row), on_them.size)
     edits.kept &= left
 
 
@@ -176,7 +179,7 @@ def _set_loss(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
             raise errors.BadLoss(f"change loss of factor {_id(graph, rows, bad)}", f"{scale[bad[0]]:g}", wanted)
         code, edits.scale[rows] = LOSSES[change.loss], scale
     edits.loss[rows] = code
-    edits.touched[rows] = True
+    edits.touched[rows_of_factors(graph.fac, rows)] = True
 
 
 def _weigh(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
@@ -187,7 +190,7 @@ def _weigh(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
         raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]), f"from {least:g} to {most:g}")
     np.multiply.at(edits.weight, rows, weight)
     _check_weighed(graph, edits, rows)
-    edits.touched[rows] = True
+    edits.touched[rows_of_factors(graph.fac, rows)] = True
 
 
 def _check_weighed(graph: FactorGraph, edits: Edits, rows: I64) -> None:
@@ -253,8 +256,8 @@ def _marginalize(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     made, replaced = marginals(graph, gone, edits.kept)
     edits.added += made
     edits.stays[gone] = False
-    ends = graph.fac[: edits.kept.size, at.F_I : at.F_J + 1]
-    edits.kept &= ~np.isin(ends, gone).any(axis=1)
+    fac = graph.fac[: edits.kept.size]
+    edits.kept &= ~of_whole_factors(fac, np.asarray(np.isin(fac[:, at.F_I : at.F_J + 1], gone).any(axis=1)))
     edits.kept[replaced] = False
 
 

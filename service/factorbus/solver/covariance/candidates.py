@@ -12,8 +12,10 @@ from factorbus.solver.covariance.kernels.innovation import distances_and_gains, 
 from factorbus.solver.covariance.square_root import LARGEST
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import is_first
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.groups import FactorsLike
+from factorbus.solver.graph.linearized import linearize_factor
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.candidates import evaluate_factors
@@ -25,11 +27,10 @@ _CHUNK = 512  # factors whose Jacobians stay in the cache between two kernels
 class Candidates:
     """Factors k, in the order they were given.
 
-    ends (n, 2): variables, −1: none   dims (n,): of the residuals   distance (n,): d²   gain (n,): nats
+    dims (n,): of the residuals   distance (n,): d²   gain (n,): nats
     predicted (n, d, d): T = H Σ Hᵀ, upper left corners
     """
 
-    ends: I64
     dims: I64
     distance: F64
     gain: F64
@@ -74,9 +75,34 @@ def admitted(graph: FactorGraph, groups: Sequence[FactorsLike]) -> Iterator[None
 
 
 def evaluate_rows(blocks: CovarianceBlocks, first: int, last: int) -> Candidates:
-    """The same for the factors first .. last−1 of the graph."""
-    graph, n = blocks.factored.graph, last - first
-    ends = np.ascontiguousarray(graph.fac[first:last, at.F_I : at.F_J + 1])
+    """The same for the factors in the rows first .. last−1 of the graph."""
+    graph = blocks.factored.graph
+    rows = first + np.flatnonzero(is_first(graph.fac[first:last]))
+    many = graph.fac[rows, at.F_FLAGS] >> at.ROWS_SHIFT > 0
+    if not many.any():
+        return _of_pairs(blocks, rows)
+    sizes = _SIZES[graph.fac[rows, at.F_KIND], 0]
+    found = Candidates(sizes, np.empty(rows.size), np.empty(rows.size), np.zeros((rows.size, *(int(sizes.max()),) * 2)))
+    few = np.flatnonzero(~many)
+    pairs = _of_pairs(blocks, rows[few])
+    found.distance[few], found.gain[few] = pairs.distance, pairs.gain
+    found.predicted[few, : pairs.predicted.shape[1], : pairs.predicted.shape[2]] = pairs.predicted
+    for k in np.flatnonzero(many).tolist():
+        linear, d = linearize_factor(graph, int(rows[k])), int(sizes[k])
+        T = linear.J @ blocks.joint(linear.ends) @ linear.J.T
+        found.predicted[k, :d, :d] = T
+        root = np.linalg.cholesky(linear.W)
+        L, y = np.linalg.cholesky(np.eye(d) + root.T @ T @ root), root.T @ linear.r
+        found.distance[k], found.gain[k] = float(y @ np.linalg.solve(L @ L.T, y)), float(np.log(L.diagonal()).sum())
+    if not np.isfinite(found.distance).all():
+        raise errors.NotFinite("the distance of a candidate")
+    return found
+
+
+def _of_pairs(blocks: CovarianceBlocks, rows: I64) -> Candidates:
+    """The same of factors of one or two variables."""
+    graph, n = blocks.factored.graph, rows.size
+    ends = np.ascontiguousarray(graph.fac[rows, at.F_I : at.F_J + 1])
     both = np.flatnonzero(ends[:, 1] >= 0)
     diagonal, places = _diagonal(blocks, ends, _hub(ends[both]))
     if both.size == n:
@@ -84,20 +110,20 @@ def evaluate_rows(blocks: CovarianceBlocks, first: int, last: int) -> Candidates
     else:
         cross = np.zeros((n, blocks.width, blocks.width))
         cross[both] = blocks.pairs(ends[both, 0], ends[both, 1])
-    sizes = _SIZES[graph.fac[first:last, at.F_KIND]]
+    sizes = _SIZES[graph.fac[rows, at.F_KIND]]
     dims = sizes[:, 0].copy()
     widest = int(dims.max(initial=1))
     distance, gain, predicted = np.empty(n), np.empty(n), np.empty((n, widest, widest))
     r, A, B, W = _room(min(n, _CHUNK))
     for start in range(0, n, _CHUNK):
         stop = min(start + _CHUNK, n)
-        rows = slice(start, stop)
-        evaluate_factors(np.arange(first + start, first + stop), graph.array_table, graph.values, r, A, B, W)
-        predicted_covariances(places[rows], sizes[rows], A, B, diagonal, cross[rows], predicted[rows])
-        distances_and_gains(sizes[rows], r, W, predicted[rows], distance[rows], gain[rows])
+        of = slice(start, stop)
+        evaluate_factors(rows[of], graph.array_table, graph.values, r, A, B, W)
+        predicted_covariances(places[of], sizes[of], A, B, diagonal, cross[of], predicted[of])
+        distances_and_gains(sizes[of], r, W, predicted[of], distance[of], gain[of])
     if not np.isfinite(distance).all():
         raise errors.NotFinite("the distance of a candidate")
-    return Candidates(ends, dims, distance, gain, predicted)
+    return Candidates(dims, distance, gain, predicted)
 
 
 def _hub(ends: I64) -> int:
@@ -120,7 +146,7 @@ def _diagonal(blocks: CovarianceBlocks, ends: I64, hub: int) -> tuple[F64, I64]:
 
 
 def linearized(graph: FactorGraph, first: int, last: int) -> Linear:
-    """The factors first .. last−1 at the estimate."""
+    """The factors in the rows first .. last−1, of one or two variables each, at the estimate."""
     r, A, B, W = _room(last - first)
     evaluate_factors(np.arange(first, last), graph.array_table, graph.values, r, A, B, W)
     r = np.ascontiguousarray(r[:, :LARGEST])  # without why an observation is inactive

@@ -99,12 +99,14 @@ class Upkeep:
     def _loops(self, old: int, first: int) -> list[int] | None:
         """The new factors but one for each new variable, which places it; None: not all are placed so.
 
-        Nor can there be a downdate by one of those of negative weight.
+        Nor can there be a downdate by one of those of negative weight, or of more than two variables.
         """
         if self._count - old > _MOST_NEW:
             return None
         free = {v for v in range(old, self._count) if self._scalar[v] >= 0}
         loops = []
+        if (self._graph.fac[first : self._factors, at.F_KIND] == at.MEMBER).any():
+            return None
         for k, row in enumerate(self._graph.fac[first : self._factors].tolist()):
             if LINEAR_OF_ONE[row[at.F_KIND]] and negative_rows(self._graph, first).size:
                 return None

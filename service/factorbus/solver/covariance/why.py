@@ -8,10 +8,11 @@ import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
-from factorbus.solver.covariance.candidates import Linear, evaluate_rows, linearized
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import losses_of, rows_of_factors, with_losses
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
+from factorbus.solver.graph.linearized import Linearized, linearize_factor
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.jit.compile import F64
@@ -106,8 +107,7 @@ def why_variable(blocks: CovarianceBlocks, variable: int, keeps_steps: bool) -> 
     kind = VARIABLE_KIND_OF_CODE[int(row[at.V_KIND])]
     fixed = bool(row[at.V_COLUMN] < 0)
     covariance = blocks.of(np.array([variable]))[0, : kind.dim, : kind.dim]
-    fac = graph.fac[: graph.counts[at.FACTORS]]
-    rows = np.flatnonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)).tolist()
+    rows = graph.rows_on(variable).tolist()
     factors = [_why_row(blocks, each) for each in rows]
     pivot, conditioning = (0.0, 1.0) if fixed else _pivot(blocks, variable, rows)
     linearized_step, changed, seen = (int(node[c]) if keeps_steps else -1 for c in _STEPS)
@@ -121,13 +121,8 @@ def why_variable(blocks: CovarianceBlocks, variable: int, keeps_steps: bool) -> 
 
 
 def _why_row(blocks: CovarianceBlocks, row: int) -> FactorAccount:
-    linear = linearized(blocks.factored.graph, row, row + 1)
-    if linear.W[0, 0, 0] < 0.0:
-        d = int(blocks.factored.dims[linear.ends[0, 0]])
-        H = linear.A[0, :d, :d]  # of one pose, with a residual as large
-        return _account(blocks, row, linear, H @ blocks.of(linear.ends[0, :1])[0, :d, :d] @ H.T)
-    T = evaluate_rows(blocks, row, row + 1).predicted[0]
-    return _account(blocks, row, linearized(blocks.factored.graph, row, row + 1), T)
+    linear = linearize_factor(blocks.factored.graph, row)
+    return _account(blocks, row, linear, linear.J @ blocks.joint(linear.ends) @ linear.J.T)
 
 
 def _pivot(blocks: CovarianceBlocks, variable: int, factors: list[int]) -> tuple[float, float]:
@@ -140,24 +135,21 @@ def _pivot(blocks: CovarianceBlocks, variable: int, factors: list[int]) -> tuple
     pivots = np.array([tree.numbers[row[tl.C_ROWS] + i * row[tl.C_LD] + i] for i in range(first, first + d)])
     diagonal = np.zeros(d)
     for factor in factors:
-        linear = linearized(f.graph, factor, factor + 1)
-        dim = int(linear.sizes[0, 0])
-        for end, J in ((0, linear.A), (1, linear.B)):
-            if linear.ends[0, end] == variable:
-                H = J[0, :dim, :d]
-                diagonal += np.einsum("ai,ab,bi->i", H, linear.W[0, :dim, :dim], H)
+        linear = linearize_factor(f.graph, factor)
+        H = linear.jacobian_of(variable)
+        diagonal += np.einsum("ai,ab,bi->i", H, linear.W, H)
     return float(pivots.min()), float((pivots**2 / diagonal).min())
 
 
-def _account(blocks: CovarianceBlocks, index: int, linear: Linear, T: F64) -> FactorAccount:
+def _account(blocks: CovarianceBlocks, index: int, linear: Linearized, T: F64) -> FactorAccount:
     """linear, T: with r and H times √w, as the solver has them."""
     graph = blocks.factored.graph
     row, factor = graph.fac[index], int(graph.ids_of(np.array([index]))[0])
     kind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
     d = kind.dim
-    softened, W, T = linear.r[0, :d], linear.W[0, :d, :d], T[:d, :d]
-    keys = tuple(int(graph.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)])
-    r, s = _plain(graph, index, d)
+    softened, W = linear.r, linear.W
+    keys = tuple(int(graph.keys[v]) for v in linear.ends)
+    r, s = _plain(graph, index)
     rho, inactive = _chi2(graph, index), observations.why_inactive(graph, index)
     sign = -1.0 if W[0, 0] < 0.0 else 1.0
     L = np.linalg.cholesky(sign * W)
@@ -168,17 +160,17 @@ def _account(blocks: CovarianceBlocks, index: int, linear: Linear, T: F64) -> Fa
         without = rho + float(whitened @ np.linalg.solve(np.eye(d) - M, M @ whitened))
     return FactorAccount(
         factor, kind.name, keys, r, L.T @ r, s, d, float(np.trace(W @ T)), without,
-        LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), 0.0 if inactive else _weight(r, softened), rho,
+        LOSS_OF_CODE.get(int(losses_of(row)), ""), 0.0 if inactive else _weight(r, softened), rho,
         inactive,
     )  # fmt: skip
 
 
-def _plain(graph: FactorGraph, row: int, dim: int) -> tuple[F64, float]:
+def _plain(graph: FactorGraph, row: int) -> tuple[F64, float]:
     """(r, rᵀ Ω r) of the factor in `row`, whatever its loss."""
     plain = copy.copy(graph)
-    plain.fac = graph.fac[: row + 1].copy()
-    plain.fac[row, at.F_FLAGS] &= (1 << at.LOSS_SHIFT) - 1
-    return linearized(plain, row, row + 1).r[0, :dim].copy(), _chi2(plain, row)
+    plain.fac = graph.fac[: row + int(rows_of_factors(graph.fac, np.array([row])).size)].copy()
+    plain.fac[row, at.F_FLAGS] = with_losses(plain.fac[row, at.F_FLAGS], at.NO_LOSS)
+    return linearize_factor(plain, row).r, _chi2(plain, row)
 
 
 def _chi2(graph: FactorGraph, row: int) -> float:

@@ -44,7 +44,7 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns, whole: bool = True) ->
     was then.
     """
     raw, groups, problem = (batch.raw, batch.groups, None) if isinstance(batch, Columns) else locate_columns(batch)
-    mark = graph.mark()
+    mark, first = graph.mark(), graph.next_id
     try:
         fault, g, row, rest = admit_groups(raw, groups, whole, graph.array_table)
         if fault == gt.NO_LIMITS:
@@ -60,12 +60,13 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns, whole: bool = True) ->
             raise problem
         if fault == gt.COMPOSED_OUT_OF_BOUNDS:
             raise value_out_of_bounds(graph, row)
+        graph.name_rows(mark[at.FACTORS], first)
         if rest:
             _finish(graph, groups, mark, rest)
     except BaseException:
         graph.forget(mark)
         raise
-    return mark[at.FACTORS] + graph.id_shift
+    return first
 
 
 def _finish(graph: FactorGraph, groups: I64, mark: Mark, rest: int) -> None:
@@ -149,15 +150,16 @@ def _bad_factor(
     graph: FactorGraph, kind: FactorKind, wrong: int, ends: I64, measured: F64, information: F64
 ) -> errors.SolverError:
     keys = [int(key) for key in ends]
+    later, wrong = divmod(wrong, gt.LATER_END)
     where = f"{kind} ({', '.join(map(errors.printed, keys))})"
     if wrong in (gt.UNKNOWN_FIRST, gt.UNKNOWN_SECOND):
-        return errors.UnknownVariable(keys[wrong - gt.UNKNOWN_FIRST], where)
+        return errors.UnknownVariable(keys[wrong - gt.UNKNOWN_FIRST + later], where)
     if wrong in (gt.WRONG_KIND_FIRST, gt.WRONG_KIND_SECOND):
-        end = wrong - gt.WRONG_KIND_FIRST
+        end = wrong - gt.WRONG_KIND_FIRST + later
         seen = VARIABLE_KIND_OF_CODE[int(graph.var[graph.find(keys[end]), at.V_KIND])]
         return errors.KindMismatch(keys[end], where, seen.name, kind.connects[end].name)
     if wrong == gt.SELF_LOOP:
-        return errors.SelfLoop(keys[0], where)
+        return errors.SelfLoop(keys[later], where)
     if wrong == gt.BAD_QUATERNION:
         return errors.BadQuaternion(where, float(np.linalg.norm(measured[3:7])))
     if wrong == gt.BAD_RANGE:

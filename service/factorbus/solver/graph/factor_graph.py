@@ -15,6 +15,7 @@ import numpy as np
 
 from factorbus.solver.errors import printed
 from factorbus.solver.graph.arenas import Arenas, lines
+from factorbus.solver.graph.factor_rows import ends_of_rows, first_rows, is_first, losses_of
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.graph.rows import Rows, Span
@@ -24,6 +25,7 @@ from factorbus.solver.kernels.graph.key_table import enter_keys, find_variable, 
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
+from factorbus.solver.kernels.model.factor_rows import count_rows
 from factorbus.solver.kernels.model.kinds import CAMERA
 from factorbus.solver.kernels.model.retract import common_label, gather_values
 
@@ -37,7 +39,7 @@ class FactorGraph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = records.Graph._fields
-    NOT_KEPT = ("_rows", "array_table")  # of a solver's state: they follow from the rest
+    NOT_KEPT = ("_rows", "_unlisted", "array_table")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:
         # Room for the first few hundred factors: the step that finds none takes several times as long.
@@ -54,6 +56,7 @@ class FactorGraph(Arenas):
         enter_keys(0, self.table, self.keys)
         self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
         self.id_shift = 0  # of a later row: its id less its number
+        self._unlisted: tuple[I64, int] | None = None  # both as they were before factors had several rows
         self.holes = 0  # numbers of the payload that no factor has any more
         self._rows = Rows()
 
@@ -71,6 +74,7 @@ class FactorGraph(Arenas):
         """Go back to `mark`."""
         remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
         self.counts[:] = mark
+        self.forget_ids()
         if self._rows.forget(mark[at.VARIABLES]):
             # Somebody may have an estimate of what is gone, its keys and stamps.
             self.keys, self.stamps = self.keys.copy(), self.stamps.copy()
@@ -96,7 +100,9 @@ class FactorGraph(Arenas):
         self.reserve_variables(sum(counts), sum(n * kind.size for n, kind in zip(counts, kinds, strict=True)))
         widths = [FACTOR_KIND_OF_CODE[code].width for code in factors[:, gt.G_KIND].tolist()]
         counts = factors[:, gt.G_COUNT].tolist()
-        self.reserve_factors(sum(counts), sum(n * (width + 1) for n, width in zip(counts, widths, strict=True)))
+        rows = [count_rows(len(FACTOR_KIND_OF_CODE[code].connects)) for code in factors[:, gt.G_KIND].tolist()]
+        more = sum(n * of_each for n, of_each in zip(counts, rows, strict=True))
+        self.reserve_factors(more, sum(n * (width + 1) for n, width in zip(counts, widths, strict=True)))
 
     def reserve_variables(self, more: int, numbers: int) -> None:
         """Make room for `more` variables and the numbers of all their values."""
@@ -111,7 +117,7 @@ class FactorGraph(Arenas):
             enter_keys(counts[at.VARIABLES], self.table, self.keys)
 
     def reserve_factors(self, more: int, numbers: int) -> None:
-        """Make room for `more` factors and all their numbers (measurement, information, scale of a loss)."""
+        """Make room for `more` rows of factors and all numbers of these (measurement, information, scale of a loss)."""
         counts = self.counts.tolist()
         if (need := counts[at.FACTORS] + more) > len(self.fac):
             self.fac = with_room(self.fac, need)
@@ -139,6 +145,41 @@ class FactorGraph(Arenas):
     def next_id(self) -> int:
         """The id that the next factor gets."""
         return int(self.counts[at.FACTORS]) + self.id_shift
+
+    @property
+    def factor_count(self) -> int:
+        """Factors; those of more than two variables have several rows."""
+        return int(self.counts[at.FACTORS] - self.counts[at.MEMBERS])
+
+    def rows_of_first(self, factors: int) -> int:
+        """How many rows the first `factors` of the factors have."""
+        fac = self.fac[: self.counts[at.FACTORS]]
+        if not self.counts[at.MEMBERS]:
+            return min(factors, len(fac))
+        starts = np.flatnonzero(is_first(fac))
+        return int(starts[factors]) if factors < starts.size else len(fac)
+
+    def name_rows(self, first: int, first_id: int) -> None:
+        """Give their ids to the rows from `first` on, which came last; the first of them gets `first_id`.
+
+        Where any factor has several rows, all ids are listed: those rows have the same.
+        """
+        if not self.counts[at.MEMBERS]:
+            return
+        rows = int(self.counts[at.FACTORS])
+        ids = first_id - 1 + np.cumsum(is_first(self.fac[first:rows]))
+        if self._unlisted is None and self.ids.size < first:
+            self._unlisted = self.ids, self.id_shift
+        before = self.ids if self.ids.size == first else self.ids_of(np.arange(first))
+        self.name_factors(np.concatenate([before, ids]), int(ids[-1]) + 1 if ids.size else first_id)
+
+    def forget_ids(self) -> None:
+        """Of rows that are gone, which came last."""
+        rows = int(self.counts[at.FACTORS])
+        if self._unlisted is not None and not self.counts[at.MEMBERS]:
+            (self.ids, self.id_shift), self._unlisted = self._unlisted, None
+        if self.ids.size > rows:
+            self.name_factors(self.ids[:rows], int(self.ids[rows]))
 
     def name_factors(self, ids: I64, following: int) -> None:
         """The factors that are there have these ids, ascending; the next one gets `following`."""
@@ -201,8 +242,8 @@ class FactorGraph(Arenas):
         apart: rows that are to stay in their order: behind the others, groups for each of these.
         """
         fac = self.fac[: self.counts[at.FACTORS]][:most]
-        label = (fac[:, at.F_KIND] << at.LOSS_SHIFT) + (fac[:, at.F_FLAGS] >> at.LOSS_SHIFT)
-        others, runs = np.ones(len(fac), bool), []
+        label = (fac[:, at.F_KIND] << at.LOSS_SHIFT) + losses_of(fac)
+        others, runs = is_first(fac), []
         for rows in apart:
             of = np.array(rows)[np.array(rows) < len(fac)]
             others[of] = False
@@ -212,9 +253,9 @@ class FactorGraph(Arenas):
 
     def _group(self, fac: I64, rows: I64) -> FactorGroup:
         """Factors of one kind and loss."""
-        kind, code = FACTOR_KIND_OF_CODE[int(fac[rows[0], at.F_KIND])], int(fac[rows[0], at.F_FLAGS]) >> at.LOSS_SHIFT
+        kind, code = FACTOR_KIND_OF_CODE[int(fac[rows[0], at.F_KIND])], int(losses_of(fac[rows[0]]))
         loss, picked = LOSS_OF_CODE.get(code, ""), fac[rows]
-        ends = self.keys[picked[:, at.F_I : at.F_I + len(kind.connects)]]
+        ends = self.keys[ends_of_rows(fac, rows, len(kind.connects))]
         width = kind.width + (1 if loss else 0)
         numbers = self.payload[picked[:, at.F_AT, None] + np.arange(width)]
         measured, information, scale = np.hsplit(numbers, [kind.size, kind.width])
@@ -223,24 +264,32 @@ class FactorGraph(Arenas):
 
     def factors_of(self, variable: int) -> list[str]:
         """The factors on one variable, for a person: "between_se2 (x1, x2)"."""
-        fac = self.fac[: self.counts[at.FACTORS]]
-        rows = fac[(fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)]
-        return [self.describe(row) for row in rows]
+        return [self.describe(row) for row in self.rows_on(variable).tolist()]
 
     def count_factors(self, variable: int) -> int:
         """How many factors are on one variable."""
+        return self.rows_on(variable).size
+
+    def rows_on(self, variable: int) -> I64:
+        """The first rows of the factors on one variable."""
         fac = self.fac[: self.counts[at.FACTORS]]
-        return int(np.count_nonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)))
+        rows = np.flatnonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable))
+        return np.unique(first_rows(fac)[rows]) if self.counts[at.MEMBERS] else rows
+
+    def ends_of(self, row: int) -> list[int]:
+        """The variables of the factor that begins at a row."""
+        kind = FACTOR_KIND_OF_CODE[int(self.fac[row, at.F_KIND])]
+        return ends_of_rows(self.fac, np.array([row]), len(kind.connects))[0].tolist()
 
     def columns_bytes(self) -> tuple[int, int]:
         """Bytes of all variables, and of all factors, as columns, keys and stamps included."""
-        variables, factors, values, payload, *_, stamped = self.counts.tolist()
+        variables, factors, values, payload, _, _, stamped, _ = self.counts.tolist()
         return 8 * (variables * (2 if stamped else 1) + values), 8 * (2 * factors + payload - self.holes)
 
-    def describe(self, row: I64) -> str:
-        """One row of `fac`, for a person."""
-        kind: FactorKind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
-        ends = [int(self.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)]]
+    def describe(self, row: int) -> str:
+        """The factor that begins at a row, for a person."""
+        kind: FactorKind = FACTOR_KIND_OF_CODE[int(self.fac[row, at.F_KIND])]
+        ends = [int(self.keys[v]) for v in self.ends_of(row)]
         return f"{kind} ({', '.join(printed(key) for key in ends)})"
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from factorbus.pieces import MOST
 from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import losses_of
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS
 from factorbus.solver.graph.quadratic import quadratic
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -29,7 +30,7 @@ _MOST_TOGETHER, _MOST_PIECES = 2 * MOST, 32768  # variables and factors of one f
 # Of what the pieces say on the diagonal: a sum of them that is more negative than that is so by more than rounding.
 _ROUNDING = 1e-10
 # Of each kind: numbers of its measurement; where its H begins, and how many numbers that has.
-_SIZE, _H, _H_SIZE = (np.zeros(1 + max(FACTOR_KIND_OF_CODE), np.int64) for _ in range(3))
+_SIZE, _H, _H_SIZE = (np.zeros(1 + at.MEMBER, np.int64) for _ in range(3))
 for _code, _kind in FACTOR_KIND_OF_CODE.items():
     _SIZE[_code], _H[_code] = _kind.size, sum(end.size for end in _kind.connects)
     _H_SIZE[_code] = _kind.dim * sum(end.dim for end in _kind.connects)
@@ -135,7 +136,7 @@ def _linear(graph: FactorGraph, first: int = 0) -> tuple[np.ndarray, np.ndarray]
     fac = graph.fac[first : graph.counts[at.FACTORS]]
     negative = np.zeros(len(fac), bool)
     negative[negative_rows(graph, first) - first] = True
-    return LINEAR[fac[:, at.F_KIND]] & ((fac[:, at.F_FLAGS] >> at.LOSS_SHIFT) == at.NO_LOSS), negative
+    return LINEAR[fac[:, at.F_KIND]] & (losses_of(fac) == at.NO_LOSS), negative
 
 
 def _told_apart(graph: FactorGraph, of: np.ndarray, negative: np.ndarray, first: int = 0) -> Iterator[Joint]:

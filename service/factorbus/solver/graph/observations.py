@@ -47,7 +47,7 @@ def check(graph: FactorGraph, first_factor: int) -> None:
     if row >= 0:
         p = int(graph.fac[row, at.F_AT])
         pixel = float(graph.payload[p]), float(graph.payload[p + 1])
-        raise errors.BadSight(graph.describe(graph.fac[row]), pixel, REASONS[int(status)])
+        raise errors.BadSight(graph.describe(row), pixel, REASONS[int(status)])
 
 
 def inactive(graph: FactorGraph) -> list[tuple[int, str, str]]:
@@ -57,7 +57,7 @@ def inactive(graph: FactorGraph) -> list[tuple[int, str, str]]:
         row, status = find_lost(False, row + 1, last, graph.var, graph.fac, graph.values, graph.payload)
         if row < 0:
             return found
-        found.append((int(graph.ids_of(np.array([row]))[0]), graph.describe(graph.fac[row]), REASONS[int(status)]))
+        found.append((int(graph.ids_of(np.array([row]))[0]), graph.describe(row), REASONS[int(status)]))
 
 
 def why_inactive(graph: FactorGraph, factor: int) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FactorKind
+from factorbus.solver.graph.linearized import Linearized, linearize_factor
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VariableKind
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -30,12 +31,16 @@ class Quadratic:
 def quadratic(graph: FactorGraph, rows: Iterable[int], first: list[int]) -> Quadratic:
     """Of the factors `rows`; the variables `first` come first, behind them the others on these factors, ascending."""
     rows = list(rows)
-    ends = {v for v in graph.fac[rows, at.F_I : at.F_J + 1].ravel().tolist() if v >= 0} - set(first)
+    ends = {v for row in rows for v in graph.ends_of(row)} - set(first)
     variables, starts, size = [*first, *sorted(v for v in ends if graph.var[v, at.V_COLUMN] >= 0)], {}, 0
     for v in variables:
         starts[v], size = size, size + kind_of(graph, v).dim
     information, eta, plus = np.zeros((size, size)), np.zeros(size), np.zeros(size)
     for kind, of in _by_kind(graph, rows):
+        if len(kind.connects) > 2:
+            for row in of.tolist():
+                _add_many(linearize_factor(graph, row), starts, information, eta, plus)
+            continue
         J, W, r = _evaluated(graph, kind, of)
         there = graph.fac[of, at.F_I : at.F_I + len(kind.connects)]
         place = np.array([[starts.get(v, -1) for v in ends] for ends in there.tolist()])
@@ -52,6 +57,21 @@ def quadratic(graph: FactorGraph, rows: Iterable[int], first: list[int]) -> Quad
                 if e == f:
                     np.add.at(plus, at_e[both], np.maximum(added.diagonal(axis1=1, axis2=2), 0.0))
     return Quadratic(variables, starts, information, eta, plus)
+
+
+def _add_many(factor: Linearized, starts: dict[int, int], information: F64, eta: F64, plus: F64) -> None:
+    """Add a factor of more than two variables."""
+    place = np.concatenate(
+        [
+            starts[v] + np.arange(d) if v in starts else np.full(d, -1)
+            for v, d in zip(factor.ends.tolist(), factor.dims.tolist(), strict=True)
+        ]
+    )
+    inside, WJ = place >= 0, factor.W @ factor.J
+    added = (factor.J.T @ WJ)[np.ix_(inside, inside)]
+    information[np.ix_(place[inside], place[inside])] += added
+    eta[place[inside]] -= WJ.T[inside] @ factor.r
+    plus[place[inside]] += added.diagonal()
 
 
 def _by_kind(graph: FactorGraph, rows: list[int]) -> Iterator[tuple[FactorKind, I64]]:

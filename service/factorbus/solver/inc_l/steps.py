@@ -288,7 +288,7 @@ class IncrementalSteps:
             chi2=max(result.chi2, 0.0),
             chi2_before=self._done.chi2 + added,
             new_variables=int(self._graph.counts[at.VARIABLES]) - self._done.graph[at.VARIABLES],
-            new_factors=int(self._graph.counts[at.FACTORS]) - self._done.graph[at.FACTORS],
+            new_factors=self._graph.factor_count - self._done.graph[at.FACTORS] + self._done.graph[at.MEMBERS],
             changed=int(self._changed.size),
             relinearized=result.iterations * columns,
             eliminated=plan.rows + result.factorizations * columns,

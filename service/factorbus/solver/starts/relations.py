@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import losses_of
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -32,15 +33,16 @@ class PoseSpace:
     bearing: int
     linear_pair: int
     linear: int
+    between_mount: int
 
 
 PLANE = PoseSpace(
     2, at.SE2, at.POINT2, at.PRIOR_SE2, at.PRIOR_POINT2, at.BETWEEN_SE2, at.LANDMARK_SE2, at.POSITION_SE2,
-    at.BEARING_SE2, at.LINEAR_PAIR_SE2, at.LINEAR_SE2,
+    at.BEARING_SE2, at.LINEAR_PAIR_SE2, at.LINEAR_SE2, at.FACTOR_CODES["between_se2_mount"],
 )  # fmt: skip
 SPACE = PoseSpace(
     3, at.SE3, at.POINT3, at.PRIOR_SE3, at.PRIOR_POINT3, at.BETWEEN_SE3, at.LANDMARK_SE3, at.POSITION_SE3,
-    at.BEARING_SE3, at.LINEAR_PAIR_SE3, at.LINEAR_SE3,
+    at.BEARING_SE3, at.LINEAR_PAIR_SE3, at.LINEAR_SE3, at.FACTOR_CODES["between_se3_mount"],
 )  # fmt: skip
 
 
@@ -112,7 +114,8 @@ def relations_of(graph: FactorGraph, space: PoseSpace) -> tuple[Relations, Direc
 def _parts(graph: FactorGraph, space: PoseSpace) -> list[tuple[np.ndarray, ...]]:
     parts = [_poses(graph, space, space.between), _poses(graph, space, space.prior)]
     parts += [_points(graph, space, space.landmark), _points(graph, space, space.prior_point)]
-    parts += [_positions(graph, space), _linear_pairs(graph, space), _linear(graph, space), _bearings(graph, space)]
+    parts += [_between_sensors(graph, space), _positions(graph, space), _bearings(graph, space)]
+    parts += [_linear_pairs(graph, space), _linear(graph, space)]
     if space.dim == 2:
         parts += [_bearing_ranges(graph), _headings(graph)]
     return parts
@@ -133,7 +136,7 @@ def _rows(graph: FactorGraph, kind: int) -> tuple[I64, I64, F64, F64]:
 
 def _losses(graph: FactorGraph, kind: int, fac: I64) -> tuple[I64, F64]:
     """The codes of the losses, and their scales."""
-    declared, loss = FACTOR_KIND_OF_CODE[kind], fac[:, at.F_FLAGS] >> at.LOSS_SHIFT
+    declared, loss = FACTOR_KIND_OF_CODE[kind], losses_of(fac)
     scale, robust = np.ones(len(fac)), np.flatnonzero(loss != at.NO_LOSS)
     scale[robust] = graph.payload[fac[robust, at.F_AT] + declared.size + declared.triangle]
     return loss, scale
@@ -176,6 +179,21 @@ def _poses(graph: FactorGraph, space: PoseSpace, kind: int) -> tuple[np.ndarray,
     t_information = R @ information[:, :d, :d] @ R.transpose(0, 2, 1)
     turn, couple = _turn(information, d), R @ information[:, :d, d:]
     return _made(graph, kind, rows, fac, a, b, t, t_information, R=R, turn=turn, couple=couple)
+
+
+def _between_sensors(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
+    """Robots from what a sensor has measured of its own way, the mount as it is now: m z m⁻¹."""
+    rows, fac, measured, information = _rows(graph, space.between_mount)
+    (R, t), d = poses_apart(measured), space.dim
+    mounts = _value(graph, graph.fac[rows + 1, at.F_J], 3 if d == 2 else 7)
+    Q, q = poses_apart(mounts)
+    back = Q.transpose(0, 2, 1)
+    moved, turned = Q @ R, Q @ R @ back
+    t = (Q @ t[:, :, None] - turned @ q[:, :, None])[:, :, 0] + q
+    t_information = moved @ information[:, :d, :d] @ moved.transpose(0, 2, 1)
+    a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
+    kind, turn = space.between_mount, _turn(information, d)
+    return _made(graph, kind, rows, fac, a, b, t, t_information, R=turned, turn=turn)
 
 
 def _turn(information: F64, d: int) -> F64:

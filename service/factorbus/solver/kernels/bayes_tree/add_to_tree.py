@@ -10,6 +10,7 @@ from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import is_member, loss_code, rows_of
 from factorbus.solver.kernels.model.kinds import is_bounded
 from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph
@@ -66,11 +67,11 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         link[f, tl.L_OWN] = link[f, tl.L_STAMP] = -1
         link[f, tl.L_KIND] = fac[f, at.F_KIND]
-        if not is_bounded(fac[f, at.F_KIND]) or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
+        if not is_bounded(fac[f, at.F_KIND]) or loss_code(f, fac) != at.NO_LOSS:
             link[f, tl.L_KIND] = tl.EXACT
             state[tl.S_EXACT] += 1
-        link[f, tl.L_AT] = state[tl.S_HESSIAN]
-        state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
+        if not is_member(f, fac):
+            place_hessians(f, var, fac, link, state)
         linearize_factor(graph, tree, f, scratch)
         _save(i, saved[2 * (f - f0)], var, node, scalars, turns)
         if j >= 0:
@@ -80,10 +81,13 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
         totals[tl.T_LARGEST_DIAGONAL] = max(totals[tl.T_LARGEST_DIAGONAL], largest_diagonal_of(i, var, scalars))
         if j >= 0:
             totals[tl.T_LARGEST_DIAGONAL] = max(totals[tl.T_LARGEST_DIAGONAL], largest_diagonal_of(j, var, scalars))
-        factor_errors[f, tl.E_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
+        factor_errors[f, tl.E_CHI2] = 0.0
+        if not is_member(f, fac):
+            factor_errors[f, tl.E_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
         factor_errors[f, tl.E_ERROR] = factor_errors[f, tl.E_COUNTED] = 0.0
         totals[tl.T_ADDED] += factor_errors[f, tl.E_CHI2]
-        finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(factor_errors[f, tl.E_CHI2])
+        finite &= math.isfinite(hessian[last_of_hessian(f, var, fac, link)])
+        finite &= math.isfinite(factor_errors[f, tl.E_CHI2])
         note_moved(MODEL, i, node, moved, state)
         link[f, tl.L_I], node[i, tl.N_ADJ] = node[i, tl.N_ADJ], 2 * f
         node[i, tl.N_SEEN] = state[tl.S_STEP]
@@ -92,6 +96,22 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
             node[j, tl.N_SEEN] = state[tl.S_STEP]
     state[tl.S_FACTORS] = f1
     return finite
+
+
+@inline_kernel
+def place_hessians(f: int, var: I64, fac: I64, link: I64, state: I64) -> None:
+    """Room for the Hessians of all rows of the factor that begins at row f."""
+    for row in range(f, f + rows_of(f, fac)):
+        link[row, tl.L_AT] = state[tl.S_HESSIAN]
+        state[tl.S_HESSIAN] = last_of_hessian(row, var, fac, link) + 1
+
+
+@inline_kernel
+def last_of_hessian(row: int, var: I64, fac: I64, link: I64) -> int:
+    """Where the χ² of the Hessian of a row is, the last of its numbers."""
+    i, j = fac[row, at.F_I], fac[row, at.F_J]
+    size = hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
+    return link[row, tl.L_AT] + size - 1
 
 
 @inline_kernel

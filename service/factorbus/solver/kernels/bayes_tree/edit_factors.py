@@ -20,6 +20,7 @@ from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, loss_code, rows_of
 from factorbus.solver.kernels.model.kinds import is_bounded
 from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph, graph_at
@@ -170,16 +171,19 @@ def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         di, dj = dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0
         last = link[f, tl.L_AT] + hessian_size(di, dj) - 1
+        if is_member(f, fac):  # linearized with the first row of its factor
+            continue
         was, linear_was = factor_errors[f, tl.E_CHI2], hessian[last]
         if is_bounded(fac[f, at.F_KIND]):
             note_loss(f, fac, link, state)
         linearize_factor(graph, tree, f, scratch)
-        weigh_factor(graph, tree, f, scratch)
+        for row in range(f, f + rows_of(f, fac)):
+            weigh_factor(graph, tree, row, scratch)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
         factor_errors[f, tl.E_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
         totals[tl.T_CHI2] += factor_errors[f, tl.E_CHI2] - was
         totals[tl.T_ADDED_UP] += factor_errors[f, tl.E_CHI2] + was
-        if not has_free(f, var, fac):
+        if not has_free(f, var, fac) and not is_one_of_many(f, fac):
             totals[tl.T_CONSTANT] += hessian[last] - linear_was
             totals[tl.T_MODEL] += hessian[last] - linear_was
         finite &= math.isfinite(hessian[last]) and math.isfinite(factor_errors[f, tl.E_CHI2])
@@ -190,7 +194,7 @@ def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
 def note_loss(f: int, fac: I64, link: I64, state: I64) -> None:
     """How far a factor with a loss is from its linear model is computed, (9.11)."""
     was = link[f, tl.L_KIND] >= tl.EXACT
-    robust = fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS
+    robust = loss_code(f, fac) != at.NO_LOSS
     state[tl.S_EXACT] += int(robust) - int(was)
     link[f, tl.L_KIND] = tl.EXACT if robust else fac[f, at.F_KIND]
 

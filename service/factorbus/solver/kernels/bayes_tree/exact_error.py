@@ -8,8 +8,10 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import end_of, is_one_of_many
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.many import linearize_many, square_of
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
 
@@ -24,6 +26,8 @@ def exact_error(
     """What the model of factor f, linearized at `lin`, misses at `values` = lin ⊞ δ, in standard deviations: of the
     residual, (9.11), and of the force, as its Jacobian is another one there, (9.31); and its χ² there.
     """
+    if is_one_of_many(f, fac):
+        return exact_error_of_many(f, var, fac, lin, values, payload, delta)
     r, now, A, B = np.zeros(at.R_SIZE), np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     A_now, B_now = np.zeros((6, 6)), np.zeros((6, 6))
     chi2 = evaluate_apart(f, var, fac, values, payload, now, A_now, B_now)
@@ -48,6 +52,35 @@ def exact_error(
             total += 2.0 * gap * payload[p] * (now[b] - r[b])
             chi2 += 2.0 * now[a] * payload[p] * now[b]
             p += 1
+    return SWITCHED if switched else math.sqrt(max(total, 0.0)), math.sqrt(force), chi2
+
+
+@part
+def exact_error_of_many(
+    f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64
+) -> tuple[float, float, float]:  # fmt: skip
+    """The same of a factor of more than two variables."""
+    more, now = linearize_many(f, var, fac, values, payload)
+    _, was = linearize_many(f, var, fac, lin, payload)
+    dim, kind, start = len(now.W), fac[f, at.F_KIND], now.start
+    chi2, force, total = more + square_of(now), 0.0, 0.0
+    switched = is_camera(kind) and (was.r[at.R_STATUS] != GOOD) != (now.r[at.R_STATUS] != GOOD)
+    for n in range(start.size - 1):
+        d = var[end_of(f, n, fac), at.V_SCALAR]
+        if d < 0:
+            continue
+        for c in range(start[n], start[n + 1]):
+            turned = diagonal = 0.0
+            for a in range(dim):
+                was.r[a] += was.J[a, c] * delta[d + c - start[n]]
+                for b in range(dim):
+                    turned += (now.J[a, c] - was.J[a, c]) * now.W[a, b] * now.r[b]
+                    diagonal += now.J[a, c] * now.W[a, b] * now.J[b, c]
+            if diagonal > 0.0:
+                force += turned * turned / diagonal
+    for a in range(dim):
+        for b in range(dim):
+            total += (now.r[a] - was.r[a]) * now.W[a, b] * (now.r[b] - was.r[b])
     return SWITCHED if switched else math.sqrt(max(total, 0.0)), math.sqrt(force), chi2
 
 

@@ -13,7 +13,9 @@ from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import is_one_of_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.many import chi2_of_many
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se2 import wrap
 from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix
@@ -94,6 +96,8 @@ def between_se3_chi2(f: int, var: I64, fac: I64, x: F64, p: F64) -> tuple[float,
 @part
 def any_chi2(f: int, var: I64, fac: I64, values: F64, payload: F64) -> float:
     """By the kernel of the kind, with the loss of the factor."""
+    if is_one_of_many(f, fac):
+        return chi2_of_many(f, var, fac, values, payload)
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     total, kind = evaluate_apart(f, var, fac, values, payload, r, A, B), fac[f, at.F_KIND]
     dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)

@@ -2,7 +2,10 @@
 
 import math
 
+import numpy as np
+
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.affected import has_free
 from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, shift_error_weight
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_isotropic
 from factorbus.solver.kernels.bayes_tree.records import Tree
@@ -10,8 +13,10 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import Panel, put, six
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, row_of_pair
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, multiply
+from factorbus.solver.kernels.model.many import Many, linearize_many, square_of
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
@@ -25,7 +30,14 @@ def hessian_size(di: int, dj: int) -> int:
 
 @part
 def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
-    """Write the Hessian of factor f at the linearization points, and what its shift error depends on there."""
+    """Write the Hessian of factor f at the linearization points, and what its shift error depends on there.
+
+    Of a factor of more than two variables with its first row that of all its rows, and with its others nothing.
+    """
+    if is_one_of_many(f, graph.fac):
+        if not is_member(f, graph.fac):
+            linearize_rows(graph, tree, f)
+        return
     kind, hessian, factor_errors, h = graph.fac[f, at.F_KIND], tree.hessian, tree.factor_errors, tree.link[f, tl.L_AT]
     more = evaluate_apart(f, graph.var, graph.fac, tree.lin[0], graph.payload, scratch.r, scratch.H[0], scratch.H[1])
     # Sizes as constants, so that each call becomes straight code.
@@ -45,6 +57,65 @@ def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None
         _write_other(graph, tree, f, more, scratch)
         if is_camera(kind):
             note_inactive(f, scratch.r[at.R_STATUS] != GOOD, tree.link, tree.state)
+
+
+@part
+def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
+    """The Hessians of all rows of the factor of more than two variables that begins at row f.
+
+    The rows (0, 1), …, (0, n−1) have the diagonal block and the gradient of their second variable, the first row those
+    of the first one and χ² too; what else there is room for is zero.  So the sum of the rows is the factor.
+    """
+    var, fac, out, link, state, totals = graph.var, graph.fac, tree.hessian, tree.link, tree.state, tree.totals
+    more, many = linearize_many(f, var, fac, tree.lin[0], graph.payload)
+    dim, ends = len(many.W), many.start.size - 1
+    last = link[f, tl.L_AT] + hessian_size(many.start[1], many.start[2] - many.start[1]) - 1
+    was, WJ = load(out, last), np.zeros(many.J.shape)
+    for a in range(dim):
+        for b in range(dim):
+            for c in range(many.start[ends]):
+                WJ[a, c] += many.W[a, b] * many.J[b, c]
+    for n in range(ends):
+        for m in range(n + 1, ends):
+            row = row_of_pair(f, n, m, ends)
+            h, di, dj = link[row, tl.L_AT], many.start[n + 1] - many.start[n], many.start[m + 1] - many.start[m]
+            _block_of(n == 0 and m == 1, many, WJ, n, n, h, out)
+            _block_of(True, many, WJ, n, m, h + di * di, out)
+            _block_of(n == 0, many, WJ, m, m, h + di * di + di * dj, out)
+            g = h + di * di + di * dj + dj * dj
+            _gradient_of(n == 0 and m == 1, many, WJ, n, g, out)
+            _gradient_of(n == 0, many, WJ, m, g + di, out)
+            put(out, g + di + dj, 0.0)
+    chi2 = more + square_of(many)
+    put(out, last, chi2)
+    if f < state[tl.S_TAKEN] and not has_free(f, var, fac):
+        # No clique takes the first row in: its χ² is among the constants.
+        totals[tl.T_CONSTANT] += chi2 - was
+        totals[tl.T_MODEL] += chi2 - was
+    if is_camera(fac[f, at.F_KIND]):
+        note_inactive(f, many.r[at.R_STATUS] != GOOD, link, state)
+
+
+@inline_kernel
+def _block_of(has: bool, many: Many, WJ: F64, n: int, m: int, h: int, out: F64) -> None:
+    """J_nᵀ Ω J_m, row by row, from h on; zeros where it is elsewhere."""
+    start, e = many.start, many.start[m + 1] - many.start[m]
+    for i in range(start[n + 1] - start[n]):
+        for j in range(e):
+            total = 0.0
+            for a in range(len(WJ) if has else 0):
+                total += many.J[a, start[n] + i] * WJ[a, start[m] + j]
+            put(out, h + i * e + j, total)
+
+
+@inline_kernel
+def _gradient_of(has: bool, many: Many, WJ: F64, n: int, g: int, out: F64) -> None:
+    """−J_nᵀ Ω r from g on; zeros where it is elsewhere."""
+    for i in range(many.start[n + 1] - many.start[n]):
+        total = 0.0
+        for a in range(len(WJ) if has else 0):
+            total += WJ[a, many.start[n] + i] * many.r[a]
+        put(out, g + i, -total)
 
 
 @inline_kernel
@@ -175,8 +246,10 @@ def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     if s >= 0:
         for a in range(di):
             scalars[1, s + a] += hessian[h + a * di + a]
-    distance = lever_of(kind, payload, fac[f, at.F_AT])
-    root = root_weight(kind, scratch.W, distance)
+    distance = root = 0.0
+    if not is_one_of_many(f, fac):  # of such a one the error is computed, (9.11)
+        distance = lever_of(kind, payload, fac[f, at.F_AT])
+        root = root_weight(kind, scratch.W, distance)
     turns[i, tl.U_LEVER] = max(turns[i, tl.U_LEVER], distance * root)
     if j >= 0:
         s = var[j, at.V_SCALAR]

@@ -28,6 +28,14 @@ from factorbus.solver.kernels.bayes_tree.relinearize import WAITS
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.sorting import put_in_order
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import (
+    count_ends,
+    end_of,
+    head_of,
+    is_member,
+    is_one_of_many,
+    loss_code,
+)
 from factorbus.solver.kernels.model.kinds import is_bounded
 from factorbus.solver.kernels.model.records import Graph
 
@@ -83,7 +91,7 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
         last, c, s = -1, 1.0, 0.0
         for f in range(state[tl.S_FACTORS]):
             v = fac[f, at.F_I]
-            how = moved_ends(node[v, tl.N_LISTED], fac[f, at.F_J], node)
+            how = how_moved(f, fac, node)
             if how != STAYED:
                 if v != last:
                     c, s = heading_of(v, var[v, at.V_KIND] == at.SE2, var, delta, values, turns)
@@ -97,13 +105,13 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
             u, slot = moved[k], node[moved[k], tl.N_ADJ]
             cu, su = heading_of(u, var[u, at.V_KIND] == at.SE2, var, delta, values, turns)
             while slot >= 0:
-                f = slot // 2
+                f = head_of(slot // 2, fac)
                 v = fac[f, at.F_I]
-                if v == u or node[v, tl.N_LISTED] == STAYED:
+                if slot // 2 == first_moved_row(f, u, fac, node):
                     c, s = cu, su
                     if v != u:
                         c, s = heading_of(v, var[v, at.V_KIND] == at.SE2, var, delta, values, turns)
-                    how = moved_ends(node[v, tl.N_LISTED], fac[f, at.F_J], node)
+                    how = how_moved(f, fac, node)
                     error, more, size, more_full, more_counted = evaluate_factor(
                         graph, tree, f, v, c, s, how, threshold
                     )
@@ -119,12 +127,42 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
 
 
 @inline_kernel
-def moved_ends(first: int, second: int, node: I64) -> int:
-    """How the variables of a factor moved: not at all, both as one body, or so that its linear model is evaluated."""
+def how_moved(f: int, fac: I64, node: I64) -> int:
+    """How the variables of factor f moved: not at all, both as one body, or so that its linear model is evaluated.
+
+    Of a row that is not the first of its factor: not at all.
+    """
+    first, second = node[fac[f, at.F_I], tl.N_LISTED], fac[f, at.F_J]
+    if is_one_of_many(f, fac):
+        return how_many_moved(f, fac, node)
     if second < 0:
         return first
     also = node[second, tl.N_LISTED]
     return first if first == also else MODEL
+
+
+@part
+def how_many_moved(f: int, fac: I64, node: I64) -> int:
+    """The same of a factor of more than two variables."""
+    if is_member(f, fac):
+        return STAYED
+    how = node[fac[f, at.F_I], tl.N_LISTED]
+    for n in range(1, count_ends(f, fac)):
+        if node[end_of(f, n, fac), tl.N_LISTED] != how:
+            return MODEL
+    return how
+
+
+@inline_kernel
+def first_moved_row(f: int, u: int, fac: I64, node: I64) -> int:
+    """The row by which factor f is found from its first variable that moved, where that is u; else −1."""
+    if node[fac[f, at.F_I], tl.N_LISTED] != STAYED:
+        return f if fac[f, at.F_I] == u else -1
+    for n in range(1, count_ends(f, fac)):
+        v = end_of(f, n, fac)
+        if node[v, tl.N_LISTED] != STAYED:
+            return f + n - 1 if v == u else -1
+    return -1
 
 
 @inline_kernel
@@ -140,14 +178,14 @@ def evaluate_factor(
     node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
     lin, delta, error, full = tree.lin[0], tree.scalars[0], 0.0, 0.0
     kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
-    if not is_bounded(kind) or kind == at.PRIOR_SE3 or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
+    if not is_bounded(kind) or kind == at.PRIOR_SE3 or loss_code(f, fac) != at.NO_LOSS:
         if how < MODEL:
             chi2 = any_chi2(f, var, fac, values, payload)
         else:
             error, force, chi2 = exact_error(f, var, fac, lin, values, payload, delta)
             error = min(error, MOST_ERROR)
             full = min(error + force, MOST_ERROR)
-            full = ROBUST * full if fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS else full
+            full = ROBUST * full if loss_code(f, fac) != at.NO_LOSS else full
             if error > threshold:
                 mark_ends_pending(f, fac, var, node, pending, state)
     else:
@@ -213,9 +251,9 @@ def mark_large_errors(least: float, graph: Graph, tree: Tree) -> None:
 @inline_kernel
 def mark_ends_pending(f: int, fac: I64, var: I64, node: I64, pending: I64, state: I64) -> None:
     """The variables of factor f that are free are to be relinearized."""
-    for end in range(2):
-        v = fac[f, at.F_I + end]
-        if v >= 0 and var[v, at.V_COLUMN] >= 0:
+    for n in range(count_ends(f, fac)):
+        v = end_of(f, n, fac)
+        if var[v, at.V_COLUMN] >= 0:
             mark_pending(v, node, pending, state)
 
 

@@ -8,6 +8,7 @@ from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import I64, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import head_of
 from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
@@ -62,14 +63,14 @@ def linearize_around(graph: Graph, tree: Tree, variables: I64) -> None:
 
     In that of the variables, which is the tree's, it takes twice as long.
     """
-    node, link, state = tree.node, tree.link, tree.state
+    fac, node, link, state = graph.fac, tree.node, tree.link, tree.state
     scratch = make_scratch()
     state[tl.S_SWEEP] += 1
     sweep, count, first, last = state[tl.S_SWEEP], 0, state[tl.S_FACTORS], -1
     for k in range(variables.size):
         slot = node[variables[k], tl.N_ADJ]
         while slot >= 0:
-            f = slot // 2
+            f = head_of(slot // 2, fac)
             if link[f, tl.L_STAMP] != sweep:
                 link[f, tl.L_STAMP] = sweep
                 first, last, count = min(first, f), max(last, f), count + 1
@@ -82,7 +83,7 @@ def linearize_around(graph: Graph, tree: Tree, variables: I64) -> None:
     for k in range(variables.size):
         slot = node[variables[k], tl.N_ADJ]
         while slot >= 0:
-            f = slot // 2
+            f = head_of(slot // 2, fac)
             if link[f, tl.L_STAMP] == sweep:
                 link[f, tl.L_STAMP] = -1
                 linearize_factor(graph, tree, f, scratch)

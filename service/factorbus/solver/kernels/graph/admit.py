@@ -13,9 +13,19 @@ from factorbus.solver.kernels.graph.key_table import slot_of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find_outside
+from factorbus.solver.kernels.model.factor_rows import count_rows, row_of_pair
 from factorbus.solver.kernels.model.kinds import is_camera, is_linear
 from factorbus.solver.kernels.model.records import Graph, graph_at
-from factorbus.solver.kernels.model.sizes import dim_of, information_at, kinds_of_ends, scale_at, size_of
+from factorbus.solver.kernels.model.sizes import (
+    MOST_ENDS,
+    arity_of,
+    dim_of,
+    information_at,
+    kind_of_end,
+    kinds_of_ends,
+    scale_at,
+    size_of,
+)
 
 
 @kernel("UniTuple(int64, 4)(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], boolean, int64[::1])")
@@ -69,7 +79,7 @@ def look_over(groups: I64, graph: Graph) -> int:
         if groups[g, gt.G_FACTORS] == 0:
             variables, numbers = variables + count, numbers + count * size_of(kind)
         else:
-            factors += count
+            factors += count * count_rows(arity_of(kind))
             measured += count * (scale_at(kind) + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0))
             if is_camera(kind) and groups[g, gt.G_LIMITED] == 0:
                 return gt.NO_LIMITS
@@ -112,12 +122,16 @@ def append_factors(raw: bytes, group: I64, whole: bool, graph: Graph, scratch: F
     order, or (−1, GOOD, …).  scratch (6, 6)."""
     kind, loss, payload, counts = group[gt.G_KIND], group[gt.G_LOSS], graph.payload, graph.counts
     size, width = information_at(kind), scale_at(kind)
-    triangle, arity = width - size, 1 if kinds_of_ends(kind)[1] < 0 else 2
+    triangle, arity, ends = width - size, arity_of(kind), np.empty(MOST_ENDS, np.int64)
     may_be_negative = whole and loss == at.NO_LOSS and arity == 1 and is_linear(kind)
     rest = gt.OBSERVED if is_camera(kind) else 0
     for n in range(group[gt.G_COUNT]):
         p, first = counts[at.PAYLOAD], group[gt.G_KEYS] + 8 * n * arity
-        i, j, fault = find_ends(kind, int_at(raw, first), int_at(raw, first + 8 * (arity - 1)), graph)
+        i = j = -1
+        if arity <= 2:
+            i, j, fault = find_ends(kind, int_at(raw, first), int_at(raw, first + 8 * (arity - 1)), graph)
+        else:
+            fault = find_many_ends(kind, raw, first, graph, ends)
         if fault != gt.GOOD:
             return n, fault, rest
         copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p)
@@ -138,7 +152,10 @@ def append_factors(raw: bytes, group: I64, whole: bool, graph: Graph, scratch: F
                 return n, gt.BAD_SCALE, rest
             payload[p + width] = scale
             numbers += 1
-        append_factor(kind, loss, i, j, numbers, graph)
+        if arity <= 2:
+            append_factor(kind, loss, i, j, numbers, graph)
+        else:
+            append_rows(kind, loss, ends[:arity], numbers, graph)
     return -1, gt.GOOD, rest
 
 
@@ -181,6 +198,43 @@ def find_ends(kind: int, a: int, b: int, graph: Graph) -> tuple:
     if var[j, at.V_KIND] != second and not has_become_a_point:
         return i, j, gt.WRONG_KIND_SECOND
     return i, j, gt.GOOD
+
+
+@part
+def find_many_ends(kind: int, raw: bytes, keys: int, graph: Graph, ends: I64) -> int:
+    """Write to `ends` the variables whose keys begin at raw[keys], for a factor of that kind of more than two.
+
+    Gives GOOD, or what is wrong: of which variable with LATER_END more for each before it.
+    """
+    for n in range(arity_of(kind)):
+        v = graph.table[slot_of(int_at(raw, keys + 8 * n), graph.table, graph.keys)] - 1
+        if v < 0:
+            return gt.UNKNOWN_FIRST + gt.LATER_END * n
+        if graph.var[v, at.V_KIND] != kind_of_end(kind, n):
+            return gt.WRONG_KIND_FIRST + gt.LATER_END * n
+        for m in range(n):
+            if ends[m] == v:
+                return gt.SELF_LOOP + gt.LATER_END * n
+        ends[n] = v
+    return gt.GOOD
+
+
+@part
+def append_rows(kind: int, loss: int, ends: I64, numbers: int, graph: Graph) -> None:
+    """One more factor of more than two variables: a row for each pair of them (`factor_rows`)."""
+    fac, counts, count = graph.fac, graph.counts, count_rows(ends.size)
+    first = counts[at.FACTORS]
+    for n in range(ends.size):
+        for m in range(n + 1, ends.size):
+            f = row_of_pair(first, n, m, ends.size)
+            fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT] = at.MEMBER, ends[n], ends[m], -1
+            fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ] = -1, -1, -1
+            fac[f, at.F_FLAGS] = (f - first) << at.OFFSET_SHIFT
+    fac[first, at.F_KIND], fac[first, at.F_AT] = kind, counts[at.PAYLOAD]
+    fac[first, at.F_FLAGS] = count << at.ROWS_SHIFT | loss << at.LOSS_SHIFT
+    counts[at.PAYLOAD] += numbers
+    counts[at.FACTORS] += count
+    counts[at.MEMBERS] += count - 1
 
 
 @inline_kernel

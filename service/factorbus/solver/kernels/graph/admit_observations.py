@@ -7,7 +7,9 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import observation
+from factorbus.solver.kernels.model.factor_rows import is_one_of_many
 from factorbus.solver.kernels.model.kinds import is_camera, lens_at
+from factorbus.solver.kernels.model.many import linearize_many
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.lenses.layout import GOOD, VERTICAL
 from factorbus.solver.lenses.models import ray
@@ -24,7 +26,14 @@ def find_lost(new: bool, f0: int, f1: int, var: I64, fac: I64, values: F64, payl
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
         kind = fac[f, at.F_KIND]
-        if is_camera(kind):
+        if is_camera(kind) and is_one_of_many(f, fac):
+            status = status_of_pixel(kind, payload, fac[f, at.F_AT]) if new else GOOD
+            if status == GOOD:
+                _, many = linearize_many(f, var, fac, values, payload)
+                status = int(many.r[at.R_STATUS])
+            if status != GOOD:
+                return f, status
+        elif is_camera(kind):
             x, y, p = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
             status = status_of_pixel(kind, payload, p) if new else GOOD
             if status == GOOD:

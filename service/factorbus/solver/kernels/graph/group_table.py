@@ -36,6 +36,9 @@ NOT_POSITIVE_DEFINITE = 10
 BAD_SCALE = 11
 BAD_DIRECTION = 12
 
+# Of a factor of more than two variables: for each variable before the one that is wrong, to what is wrong of the first.
+LATER_END = 100
+
 # What else admission may find, before it takes anything or after it took all.
 NO_ROOM = 13  # the arenas of the graph are too short
 NO_LIMITS = 14  # what a camera saw has not got the limits of its lens

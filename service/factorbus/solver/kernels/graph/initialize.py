@@ -9,7 +9,9 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import place_idp
-from factorbus.solver.kernels.model.kinds import initializes
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of, is_one_of_many
+from factorbus.solver.kernels.model.kinds import initializes, mounted_kind
+from factorbus.solver.kernels.model.many import POSE, copy_pose, put_sensor
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.se2 import (
     compose_inverse_se2,
@@ -83,6 +85,8 @@ def reach_on(compose: bool, v0: int, f0: int, f1: int, graph: Graph, reached: I6
 def follow(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
     """The variable that factor `f` reaches now, or _NOTHING, or _WAITS: both ends are still out of reach."""
     kind, i, j, z = fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT]
+    if is_one_of_many(f, fac):
+        return follow_many(compose, head_of(f, fac), v0, var, fac, x, p, reached)
     if not initializes(kind):  # a pixel alone, say
         return _NOTHING
     has_i = i < v0 or reached[i - v0] != 0
@@ -104,6 +108,43 @@ def follow(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, r
     new = j if has_i else i
     if compose:
         compose_end(kind, has_i, var[i, at.V_AT], var[j, at.V_AT], z, x, p)
+    reached[new - v0] = 1
+    return new
+
+
+@part
+def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
+    """The same of the factor of more than two variables that begins at row f, for any of its rows: each waits for its
+    two variables.  A mount follows from nothing, and all else from it.
+    """
+    of, count, missing = mounted_kind(fac[f, at.F_KIND]), 0, -1
+    if not initializes(of):
+        return _NOTHING
+    for n in range(count_ends(f, fac)):
+        v = end_of(f, n, fac)
+        if v >= v0 and reached[v - v0] == 0:
+            count, missing = count + 1, n
+    if count == 0:
+        return _NOTHING
+    between = of == at.BETWEEN_SE2 or of == at.BETWEEN_SE3
+    if count > 1 or missing == 2 or (missing == 0 and not between):
+        return _WAITS
+    new = end_of(f, missing, fac)
+    if compose:
+        known, y = end_of(f, 1 - missing, fac), np.zeros(3 * POSE)
+        planar, forward = var[known, at.V_KIND] == at.SE2, missing == 1
+        copy_pose(planar, x, var[end_of(f, 2, fac), at.V_AT], y, 0)
+        put_sensor(planar, x, var[known, at.V_AT], y, POSE)
+        compose_end(of, forward, POSE if forward else 2 * POSE, 2 * POSE if forward else POSE, fac[f, at.F_AT], y, p)
+        kind, out = var[new, at.V_KIND], 2 * POSE
+        if between:
+            out = POSE
+            if planar:
+                compose_inverse_se2(y, 2 * POSE, y, 0, out)
+            else:
+                compose_inverse_se3(y, 2 * POSE, y, 0, out)
+        for c in range(size_of(kind)):
+            x[var[new, at.V_AT] + c] = y[out + c]
     reached[new - v0] = 1
     return new
 

@@ -12,7 +12,9 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.jit.small_cholesky import cholesky
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import move_idp
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.many import add_normal_equations, linearize_many, square_of
 from factorbus.solver.kernels.model.points import move_point2, move_point3
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.se2 import move_se2
@@ -78,10 +80,13 @@ def is_seen_twice(v: int, f0: int, f1: int, fac: I64) -> bool:
     """Whether more than one of the factors f0 .. f1−1 is on variable v."""
     count = 0
     for f in range(f0, f1):
-        if fac[f, at.F_I] == v or fac[f, at.F_J] == v:
+        if is_one_of_many(f, fac):
+            for n in range(0 if is_member(f, fac) else count_ends(f, fac)):
+                count += int(end_of(f, n, fac) == v)
+        elif fac[f, at.F_I] == v or fac[f, at.F_J] == v:
             count += 1
-            if count > 1:
-                return True
+        if count > 1:
+            return True
     return False
 
 
@@ -96,6 +101,10 @@ def gather_system(v: int, f0: int, f1: int, graph: Graph, linear: _Linear, M: F6
     width, chi2 = dim_of(var[v, at.V_KIND]), 0.0
     M[:, :], z[:] = 0.0, 0.0
     for f in range(f0, f1):
+        if is_one_of_many(f, fac):
+            if not is_member(f, fac):
+                chi2 += add_many(v, f, graph, M, z)
+            continue
         end = 0 if fac[f, at.F_I] == v else 1
         if fac[f, at.F_I + end] != v:
             continue
@@ -113,6 +122,17 @@ def gather_system(v: int, f0: int, f1: int, graph: Graph, linear: _Linear, M: F6
                     for j in range(i, width):
                         M[i, j] += H[end, a, i] * W[a, b] * H[end, b, j]
     return chi2
+
+
+@part
+def add_many(v: int, f: int, graph: Graph, M: F64, z: F64) -> float:
+    """The same of one factor of more than two variables, which begins at row f, if variable v is among them."""
+    for n in range(count_ends(f, graph.fac)):
+        if end_of(f, n, graph.fac) == v:
+            more, many = linearize_many(f, graph.var, graph.fac, graph.values, graph.payload)
+            add_normal_equations(n, many, M, z)
+            return more + square_of(many)
+    return 0.0
 
 
 @part

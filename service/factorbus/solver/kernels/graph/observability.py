@@ -6,10 +6,12 @@ positive definite with room to spare.  What that does not show, the numbers of t
 
 import numpy as np
 
-from factorbus.solver.kernels.jit.compile import F64, I64, kernel
+from factorbus.solver.kernels.jit.compile import F64, I64, kernel, part
 from factorbus.solver.kernels.jit.small_cholesky import cholesky
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.many import add_normal_equations, linearize_many
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 
 # The share of its diagonal entry that a pivot keeps: a point 1000 baselines away keeps 1e-6.
@@ -25,8 +27,14 @@ def mark_determined(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, 
         if determined[k] == 0:
             place[k] = count
             count += 1
-    M = np.zeros((count, 6, 6))
+    M, unused = np.zeros((count, 6, 6)), np.zeros(6)
     for f in range(f0, f1):
+        if is_one_of_many(f, fac):
+            n = only_loose(f, v0, fac, determined)
+            if n >= 0:
+                _, many = linearize_many(f, var, fac, values, payload)
+                add_normal_equations(n, many, M[place[end_of(f, n, fac) - v0]], unused)
+            continue
         i, j = fac[f, at.F_I] - v0, fac[f, at.F_J] - v0
         loose_i, loose_j = i >= 0 and determined[i] == 0, j >= 0 and determined[j] == 0
         if loose_i == loose_j:
@@ -58,4 +66,17 @@ def mark_determined(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, 
             if good:
                 determined[k] = 1
                 found += 1
+    return found
+
+
+@part
+def only_loose(f: int, v0: int, fac: I64, determined: I64) -> int:
+    """Which variable of a factor of more than two is the only one of them that is not determined; −1: there is none."""
+    found = -1
+    for n in range(0 if is_member(f, fac) else count_ends(f, fac)):
+        k = end_of(f, n, fac) - v0
+        if k >= 0 and determined[k] == 0:
+            if found >= 0:
+                return -1
+            found = n
     return found

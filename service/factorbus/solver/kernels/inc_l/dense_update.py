@@ -12,7 +12,9 @@ from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.jit.small_cholesky import cholesky
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import end_of, is_member, is_one_of_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.many import linearize_many
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 
@@ -80,6 +82,10 @@ def add_omega(f0: int, f1: int, reached: I64, start: I64, graph: Graph, place: I
     r, H, first = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.empty(2, np.int64)
     W, WH = np.zeros((6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
+        if is_one_of_many(f, fac):
+            if not is_member(f, fac):
+                add_many_omega(f, reached, start, graph, place, M, z)
+            continue
         evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
         kind = fac[f, at.F_KIND]
         dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
@@ -119,6 +125,35 @@ def add_omega(f0: int, f1: int, reached: I64, start: I64, graph: Graph, place: I
                         for a in range(dim):
                             total += H[other, a, q] * WH[a, c]
                         M[first[other] + q, first[end] + c] += total
+
+
+@part
+def add_many_omega(f: int, reached: I64, start: I64, graph: Graph, place: I64, M: F64, z: F64) -> None:
+    """The same of one factor of more than two variables, which begins at row f."""
+    var, fac = graph.var, graph.fac
+    _, many = linearize_many(f, var, fac, graph.values, graph.payload)
+    r, J, W, columns = many
+    dim, width = len(W), columns[columns.size - 1]
+    into = np.full(width, -1)  # of each column of J
+    for n in range(columns.size - 1):
+        column = var[end_of(f, n, fac), at.V_COLUMN]
+        if column >= 0:
+            u = 0
+            while reached[u] != place[column]:
+                u += 1
+            for c in range(columns[n], columns[n + 1]):
+                into[c] = start[u] + c - columns[n]
+    for c in range(width):
+        if into[c] < 0:
+            continue
+        for a in range(dim):
+            along = 0.0
+            for b in range(dim):
+                along += W[a, b] * J[b, c]
+            z[into[c]] -= along * r[a]
+            for e in range(width):
+                if 0 <= into[e] <= into[c]:
+                    M[into[e], into[c]] += J[a, e] * along
 
 
 @part

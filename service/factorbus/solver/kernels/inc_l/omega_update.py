@@ -19,7 +19,9 @@ from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, zero
 from factorbus.solver.kernels.jit.sorting import sort
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
+from factorbus.solver.kernels.model.many import linearize_many
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
@@ -79,6 +81,9 @@ def omega_update(f0: int, f1: int, graph_table: I64, rows_table: I64, ld: int, W
             zero(W, k * ld, width)
         k = 0
         for g in range(f, last):
+            if is_one_of_many(g, fac):
+                k = whiten_many(g, k, graph, rows, union, whitened)
+                continue
             evaluate_apart(g, graph.var, fac, graph.values, graph.payload, r, H[0], H[1])
             k = whiten(g, k, graph, rows, union, scratch, whitened)
         failed = sweep(height, Remaining(0, count, 0, width), union, spare, whitened, rows)
@@ -92,11 +97,14 @@ def omega_update(f0: int, f1: int, graph_table: I64, rows_table: I64, ld: int, W
 def list_ends(f0: int, f1: int, graph: Graph, place: I64, out: I64) -> int:
     """The positions of the free variables of factors f0 .. f1−1, ascending, each once; gives how many."""
     var, fac = graph.var, graph.fac
-    found, n = np.empty(2 * (f1 - f0), np.int64), 0
+    most, n = 0, 0
     for f in range(f0, f1):
-        for end in range(2):
-            v = fac[f, at.F_I + end]
-            if v >= 0 and var[v, at.V_COLUMN] >= 0:
+        most += 0 if is_member(f, fac) else count_ends(f, fac)
+    found = np.empty(most, np.int64)
+    for f in range(f0, f1):
+        for end in range(0 if is_member(f, fac) else count_ends(f, fac)):
+            v = end_of(f, end, fac)
+            if var[v, at.V_COLUMN] >= 0:
                 found[n] = place[var[v, at.V_COLUMN]]
                 n += 1
     sort(found[:n])
@@ -138,6 +146,37 @@ def whiten(f: int, k: int, graph: Graph, rows: BlockRows, union: I64, scratch: S
                 for b in range(a, dim):
                     total += C[a, b] * H[end, b, c]
                 put(W, (k + a) * ld + offset + c, total)
+    return k + dim
+
+
+@part
+def whiten_many(f: int, k: int, graph: Graph, rows: BlockRows, union: I64, whitened: WhitenedRows) -> int:
+    """`whiten` of a factor of more than two variables; of a row that is not its first nothing."""
+    var, fac, place, rec, ld = graph.var, graph.fac, rows.place, rows.rec, whitened.ld
+    if is_member(f, fac):
+        return k
+    _, many = linearize_many(f, var, fac, graph.values, graph.payload)
+    kind, dim = fac[f, at.F_KIND], len(many.W)
+    upper_factor(dim, fac[f, at.F_AT] + information_at(kind), graph.payload, many.W)
+    for a in range(dim):
+        total = 0.0
+        for b in range(a, dim):
+            total += many.W[a, b] * many.r[b]
+        whitened.rhs[k + a] = -total
+    for n in range(count_ends(f, fac)):
+        column = var[end_of(f, n, fac), at.V_COLUMN]
+        if column < 0:
+            continue
+        offset, e = 0, 0
+        while union[e] != place[column]:
+            offset += rec[union[e], br.DIM]
+            e += 1
+        for a in range(dim):
+            for c in range(many.start[n], many.start[n + 1]):
+                total = 0.0
+                for b in range(a, dim):
+                    total += many.W[a, b] * many.J[b, c]
+                put(whitened.W, (k + a) * ld + offset + c - many.start[n], total)
     return k + dim
 
 

@@ -3,6 +3,7 @@
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.many import linearize_many
 from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
@@ -27,3 +28,19 @@ def evaluate_factors(picked: I64, graph_table: I64, values: F64, r: F64, A: F64,
             for b in range(a, dim):
                 W[k, a, b] = W[k, b, a] = payload[p]
                 p += 1
+
+
+@kernel("void(int64, int64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1])")
+def evaluate_many(f: int, graph_table: I64, values: F64, r: F64, J: F64, W: F64) -> None:
+    """The factor of more than two variables that begins at row f, at `values`.
+
+    out  r (dim,), J (dim, Σ d): its Jacobians side by side, in the order of its variables, W (dim, dim)
+    """
+    graph = graph_at(graph_table)
+    _, many = linearize_many(f, graph.var, graph.fac, values, graph.payload)
+    for a in range(len(W)):
+        r[a] = many.r[a]
+        for b in range(len(W)):
+            W[a, b] = many.W[a, b]
+        for c in range(J.shape[1]):
+            J[a, c] = many.J[a, c]

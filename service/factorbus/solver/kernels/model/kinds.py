@@ -32,6 +32,7 @@ from factorbus.solver.kernels.model.range_bearing import (
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
 from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
+from factorbus.solver.kernels.model.sizes import MOST_ENDS
 from factorbus.solver.lenses.layout import GOOD
 
 _MOST = 6  # numbers of a residual and of a tangent: the size of the scratch that kernels have for a factor
@@ -53,6 +54,7 @@ class FactorModel:
                   returns what χ² has beside rᵀ Ω r
     positive_at:  where in the measurement a number has to be above zero
     quaternions:  where in the measurement quaternions begin.  directions: and directions.  Both become unit
+    mounted:      the kind that it is of a sensor at a mount that is estimated (`many`); the residual is that kind's
     """
 
     residual: Callable[..., Any]
@@ -67,6 +69,7 @@ class FactorModel:
     positive_at: int = -1
     quaternions: tuple[int, ...] = ()
     directions: tuple[int, ...] = ()
+    mounted: str = ""
 
 
 def _usual(residual: Callable[..., Any], equation: str, rigid: bool = False, **more: Any) -> FactorModel:
@@ -116,6 +119,20 @@ FACTOR_MODELS = {
     "bearing_se3": FactorModel(bearing_se3, "MATH (3.25)", rigid=True, directions=(0,)),
     **{name: _linear_model(name) for name in FACTOR_KINDS if name.startswith("linear_")},
 }
+FACTOR_MODELS |= {
+    name: FactorModel(
+        FACTOR_MODELS[kind.mounted].residual,
+        "MATH (3.35)",
+        initializes=FACTOR_MODELS[kind.mounted].initializes,
+        lens_at=FACTOR_MODELS[kind.mounted].lens_at,
+        positive_at=FACTOR_MODELS[kind.mounted].positive_at,
+        quaternions=FACTOR_MODELS[kind.mounted].quaternions,
+        directions=FACTOR_MODELS[kind.mounted].directions,
+        mounted=kind.mounted,
+    )
+    for name, kind in FACTOR_KINDS.items()
+    if kind.mounted
+}
 
 
 def check_kinds() -> None:
@@ -124,10 +141,11 @@ def check_kinds() -> None:
     for name, model in FACTOR_MODELS.items():
         kind = FACTOR_KINDS[name]
         ends = [VARIABLE_KINDS[end] for end in kind.connects]
-        if not 1 <= len(ends) <= 2 or max(kind.dim, *(end.dim for end in ends)) > _MOST:
+        most = MOST_ENDS if model.mounted else 2
+        if not 1 <= len(ends) <= most or max(kind.dim, *(end.dim for end in ends)) > _MOST:
             raise ImportError(
                 f"the factor kind {name!r} has {len(ends)} ends and a residual of the size {kind.dim}; "
-                f"kernels have room for 1 or 2 variables and {_MOST} numbers"
+                f"kernels have room for 1 to {most} variables and {_MOST} numbers"
             )
         starts = (*model.quaternions, *model.directions, model.positive_at)
         units = max(len(model.quaternions), len(model.directions))
@@ -139,7 +157,8 @@ def check_kinds() -> None:
 
 
 check_kinds()
-_MODELS = tuple(FACTOR_MODELS[name] for name in FACTOR_KINDS)
+# The last is in place of a kind's for members of a factor of more than two variables, which are not looked at alone.
+_MODELS = (*(FACTOR_MODELS[name] for name in FACTOR_KINDS), FactorModel(prior_point2, "", bounded=True))
 
 
 def _table(values: Any) -> I64:
@@ -161,11 +180,18 @@ _DIRECTIONS = _starts(model.directions for model in _MODELS)
 _CHECKED = (_POSITIVE_AT >= 0) | (_QUATERNIONS[:, 0] >= 0) | (_DIRECTIONS[:, 0] >= 0)
 # For Python, which asks for many factors at once: by the code of a kind.
 LINEAR = np.array([model.linear for model in _MODELS])
-LINEAR_OF_ONE = LINEAR & np.array([len(kind.connects) == 1 for kind in FACTOR_KINDS.values()])
+LINEAR_OF_ONE = LINEAR & np.array([*(len(kind.connects) == 1 for kind in FACTOR_KINDS.values()), False])
 CAMERA = _LENS_AT >= 0
 BOUNDED = np.array([model.bounded for model in _MODELS])
 POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])  # by the code of a kind of variables
-SEES_LANDMARK = np.array([kind.sees_landmark for kind in FACTOR_KINDS.values()])
+SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False])
+_MOUNTED = _table(at.FACTOR_CODES[model.mounted] if model.mounted else -1 for model in _MODELS)
+
+
+@inline_kernel
+def mounted_kind(kind: int) -> int:
+    """The kind that it is of a sensor at a mount that is estimated; −1: of none."""
+    return _MOUNTED[kind]
 
 
 @inline_kernel
@@ -228,8 +254,9 @@ def direction_at(kind: int, n: int) -> int:
     return _DIRECTIONS[kind, n]
 
 
-_common = {name: model for name, model in FACTOR_MODELS.items() if model.common}
-_others = {name: model for name, model in FACTOR_MODELS.items() if not model.common}
+_alone = {name: model for name, model in FACTOR_MODELS.items() if not model.mounted}
+_common = {name: model for name, model in _alone.items() if model.common}
+_others = {name: model for name, model in _alone.items() if not model.common}
 _other_residual_of = inline_kernel(dispatcher("other_residual_of", _others))
 
 

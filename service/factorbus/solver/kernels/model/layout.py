@@ -13,8 +13,9 @@ V_COLUMN = 3  # its block column in Λ; -1: fixed
 V_DIAGONAL = 4  # where its diagonal block starts in Λ's data; -1: fixed
 V_WIDTH = 5
 
-# Columns of `fac`.
-F_KIND = 0
+# Columns of `fac`: a row for a factor of one or two variables, and for one of more a row for each pair of them, one
+# behind the other (`factor_rows`).  The first is the factor's, the others are its members.
+F_KIND = 0  # MEMBER: a further pair of the factor that begins before it
 F_I = 1  # first variable
 F_J = 2  # second variable; -1: none
 F_AT = 3  # where its measurement starts in `payload`
@@ -26,7 +27,9 @@ F_WIDTH = 8
 
 # Bits of F_FLAGS.
 SWAPPED = 1  # the block of the pair stands as (j, i), because column j comes first
-LOSS_SHIFT = 8  # from here on: the code of its loss
+LOSS_SHIFT, LOSS_MASK = 8, 0xFF  # the code of its loss
+OFFSET_SHIFT, OFFSET_MASK = 16, 0xFFFF  # of a member: how many rows before it the factor begins
+ROWS_SHIFT = 32  # of a factor of more variables than two: how many rows it has; else 0
 
 # Entries of `counts`.
 VARIABLES = 0
@@ -36,7 +39,8 @@ PAYLOAD = 3
 COLUMNS = 4
 SCALARS = 5
 STAMPED = 6  # variables that have a time stamp
-COUNTS = 7
+MEMBERS = 7  # rows of `fac` that are not the first of their factor
+COUNTS = 8
 
 NO_STAMP = -(2**63)
 
@@ -49,6 +53,9 @@ SE3 = VARIABLE_CODES["se3"]
 POINT2 = VARIABLE_CODES["point2"]
 POINT3 = VARIABLE_CODES["point3"]
 IDP = VARIABLE_CODES["idp"]
+
+# In place of a kind: the row is of a pair of a factor that begins before it.
+MEMBER = len(FACTOR_KINDS)
 
 PRIOR_SE2 = FACTOR_CODES["prior_se2"]
 PRIOR_SE3 = FACTOR_CODES["prior_se3"]

@@ -14,8 +14,10 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import end_of, is_member, is_one_of_many, loss_code, row_of_pair
 from factorbus.solver.kernels.model.kinds import residual_of
 from factorbus.solver.kernels.model.losses import soften
+from factorbus.solver.kernels.model.many import linearize_many, square_of
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.sizes import end_dims, information_at, residual_dim
 
@@ -48,6 +50,10 @@ def linearize(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
     r, H = scratch.r, scratch.H
     chi2 = 0.0
     for f in range(first, last):
+        if is_one_of_many(f, fac):
+            if not is_member(f, fac):
+                chi2 += add_many(f, var, fac, values, payload, system)
+            continue
         row = fac[f]
         kind, p = row[at.F_KIND], row[at.F_AT]
         chi2 += evaluate(f, var, fac, values, payload, r, H[0], H[1])
@@ -79,7 +85,7 @@ def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B
     i = var[fac[f, at.F_I], at.V_AT]
     j = var[max(fac[f, at.F_J], 0), at.V_AT]
     more = residual_of(kind, x, Ends(i, j), payload, p, r, A, B)
-    loss = fac[f, at.F_FLAGS] >> at.LOSS_SHIFT
+    loss = loss_code(f, fac)
     if loss != at.NO_LOSS:
         more = soften(kind, loss, p, payload, more, r, A, B)
     return more
@@ -90,6 +96,48 @@ def add_other(kind: int, row: I64, var: I64, info: F64, scratch: Scratch, system
     """`add_factor` of the kinds that are not worth straight code."""
     di, dj = end_dims(kind)
     return add_factor(residual_dim(kind), di, dj, row, var, info, scratch, system)
+
+
+@part
+def add_many(f: int, var: I64, fac: I64, values: F64, payload: F64, system: NormalEquations) -> float:
+    """Add the blocks and the gradient of the factor of more than two variables that begins at row f; gives its χ²."""
+    more, many = linearize_many(f, var, fac, values, payload)
+    r, J, W, start = many
+    dim, ends, data = len(W), start.size - 1, system.data
+    WJ = np.zeros(J.shape)
+    for a in range(dim):
+        for b in range(dim):
+            for c in range(start[ends]):
+                WJ[a, c] += W[a, b] * J[b, c]
+    for n in range(ends):
+        v, d = end_of(f, n, fac), start[n + 1] - start[n]
+        if var[v, at.V_COLUMN] < 0:
+            continue
+        block, scalar = var[v, at.V_DIAGONAL], var[v, at.V_SCALAR]
+        for i in range(d):
+            total = 0.0
+            for a in range(dim):
+                total += WJ[a, start[n] + i] * r[a]
+            system.eta[scalar + i] -= total
+            for j in range(i, d):
+                total = 0.0
+                for a in range(dim):
+                    total += J[a, start[n] + i] * WJ[a, start[n] + j]
+                data[block + i * d + j] += total
+                if j > i:
+                    data[block + j * d + i] = data[block + i * d + j]
+        for m in range(n + 1, ends):
+            row = row_of_pair(f, n, m, ends)
+            block, e = fac[row, at.F_IJ], start[m + 1] - start[m]
+            if block < 0:
+                continue
+            for i in range(d):
+                for j in range(e):
+                    total = 0.0
+                    for a in range(dim):
+                        total += J[a, start[n] + i] * WJ[a, start[m] + j]
+                    data[block + (j * d + i if fac[row, at.F_FLAGS] & at.SWAPPED else i * e + j)] += total
+    return more + square_of(many)
 
 
 @inline_kernel

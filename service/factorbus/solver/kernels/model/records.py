@@ -9,10 +9,11 @@ class Graph(NamedTuple):
     """The arrays of a graph; `layout` has the columns of `var` and `fac` and the entries of `counts`.
 
     var      (n, 5) int64    one row per variable, in insertion order
-    fac      (m, 8) int64    one row per factor, in insertion order
+    fac      (m, 8) int64    rows of factors, in insertion order: one of a factor of one or two variables, of more
+                             variables one for each pair (`factor_rows`)
     values   float64         the variables' values, packed one after the other
     payload  float64         per factor: measurement, upper triangle of its information, scale of its loss if any
-    counts   (7,)   int64    how much of each array is in use
+    counts   (8,)   int64    how much of each array is in use
     keys     (n,)   int64    the variables' keys
     table    int64           where a key is found (`graph.key_table`)
     dims     (c,)   int64    scalars of each block column of Λ

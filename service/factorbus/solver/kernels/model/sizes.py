@@ -10,15 +10,18 @@ from factorbus.solver.kernels.jit.compile import inline_kernel
 from factorbus.solver.kernels.model import layout as at
 
 _FACTORS, _VARIABLES = tuple(FACTOR_KINDS.values()), tuple(VARIABLE_KINDS.values())
+MOST_ENDS = 16
 _SIZE = np.array([kind.size for kind in _VARIABLES], np.int64)
 _DIM = np.array([kind.dim for kind in _VARIABLES], np.int64)
-_RESIDUAL_DIM = np.array([kind.dim for kind in _FACTORS], np.int64)
-_MEASURED = np.array([kind.size for kind in _FACTORS], np.int64)
-_FIRST = np.array([at.VARIABLE_CODES[kind.connects[0]] for kind in _FACTORS], np.int64)
-_SECOND = np.array([at.VARIABLE_CODES[kind.connects[1]] if kind.connects[1:] else -1 for kind in _FACTORS], np.int64)
-_FIRST_DIM = _DIM[_FIRST]
-_SECOND_DIM = np.where(_SECOND >= 0, _DIM[_SECOND], 0)
-_LINEARIZED = _SIZE[_FIRST] + np.where(_SECOND >= 0, _SIZE[_SECOND], 0)
+# By the code of a kind of factor, and last of all of what is a member of a factor of more variables.
+_RESIDUAL_DIM = np.array([*(kind.dim for kind in _FACTORS), 0], np.int64)
+_MEASURED = np.array([*(kind.size for kind in _FACTORS), 0], np.int64)
+_ARITY = np.array([*(len(kind.connects) for kind in _FACTORS), 2], np.int64)
+_ENDS = np.full((len(_FACTORS) + 1, MOST_ENDS), -1, np.int64)
+for _row, _kind in enumerate(_FACTORS):
+    _ENDS[_row, : len(_kind.connects)] = [at.VARIABLE_CODES[end] for end in _kind.connects]
+_END_DIMS = np.where(_ENDS >= 0, _DIM[_ENDS], 0)
+_LINEARIZED = np.where(_ENDS >= 0, _SIZE[_ENDS], 0).sum(axis=1)
 
 
 @inline_kernel
@@ -53,15 +56,27 @@ def scale_at(kind: int) -> int:
 
 
 @inline_kernel
+def arity_of(kind: int) -> int:
+    """How many variables a kind of factor connects."""
+    return _ARITY[kind]
+
+
+@inline_kernel
+def kind_of_end(kind: int, n: int) -> int:
+    """The kind of the n-th variable that a kind of factor connects; −1: it has none."""
+    return _ENDS[kind, n]
+
+
+@inline_kernel
 def kinds_of_ends(kind: int) -> tuple:
-    """The kinds of variables that a kind of factor connects; −1: no second one."""
-    return _FIRST[kind], _SECOND[kind]
+    """The kinds of the first two variables that a kind of factor connects; −1: no second one."""
+    return _ENDS[kind, 0], _ENDS[kind, 1]
 
 
 @inline_kernel
 def end_dims(kind: int) -> tuple:
-    """Scalars in the tangents of the ends of a kind of factor; 0: no second one."""
-    return _FIRST_DIM[kind], _SECOND_DIM[kind]
+    """Scalars in the tangents of the first two ends of a kind of factor; 0: no second one."""
+    return _END_DIMS[kind, 0], _END_DIMS[kind, 1]
 
 
 @inline_kernel

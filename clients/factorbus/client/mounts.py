@@ -1,0 +1,48 @@
+"""Mounts of sensors in a graph: poses on a robot, which are not in the map's frame and do not move with it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorbus.proto.arrays import I64
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import Batch, Factors, Variables
+
+
+def mounts_of(batch: Batch) -> I64:
+    """The keys of the mounts: the last variables of factors of the kinds that have one."""
+    found = [group.keys[:, -1] for group in batch.factors if FACTOR_KINDS[group.kind].mounted]
+    return np.unique(np.concatenate([np.empty(0, np.int64), *found]))
+
+
+def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
+    """(mounts, and what is known of them alone; all else)."""
+    mounts = mounts_of(batch)
+    if not mounts.size:
+        return Batch(), batch
+    variables, factors = ([], []), ([], [])
+    for group in batch.variables:
+        of_mounts = np.isin(group.keys, mounts)
+        for half, chosen in ((0, of_mounts), (1, ~of_mounts)):
+            if chosen.any():
+                variables[half].append(_some_variables(group, chosen))
+    for group in batch.factors:
+        of_mounts = np.asarray(np.isin(group.keys, mounts).all(axis=1))
+        for half, chosen in ((0, of_mounts), (1, ~of_mounts)):
+            if chosen.any():
+                factors[half].append(rows_of_group(group, chosen))
+    first, second = (Batch(tuple(variables[half]), tuple(factors[half])) for half in (0, 1))
+    return first, second
+
+
+def _some_variables(group: Variables, chosen: np.ndarray) -> Variables:
+    values, stamps = (None if each is None else each[chosen] for each in (group.values, group.stamps))
+    return group._replace(keys=group.keys[chosen], values=values, stamps=stamps)
+
+
+def rows_of_group(group: Factors, chosen: np.ndarray) -> Factors:
+    """Some factors of a group."""
+    scale = None if group.scale is None else group.scale[chosen]
+    return group._replace(
+        keys=group.keys[chosen], measured=group.measured[chosen], information=group.information[chosen], scale=scale
+    )

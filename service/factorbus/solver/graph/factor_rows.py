@@ -1,0 +1,59 @@
+"""Rows of `fac` as Python looks at many of them: which belong together, their variables, their losses.
+
+A factor of more than two variables has a row for each pair of them (`kernels/model/factor_rows.py`).
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import I64
+from factorbus.solver.kernels.model import layout as at
+
+_LOSS = at.LOSS_MASK << at.LOSS_SHIFT
+
+
+def losses_of(fac: I64) -> I64:
+    """The code of the loss of each row."""
+    return fac[..., at.F_FLAGS] >> at.LOSS_SHIFT & at.LOSS_MASK
+
+
+def with_losses(flags: I64, losses: I64 | int) -> I64:
+    """The same flags with other losses."""
+    return flags & ~_LOSS | losses << at.LOSS_SHIFT
+
+
+def first_rows(fac: I64) -> I64:
+    """For each row (n,) the first of its factor."""
+    return np.arange(len(fac)) - (fac[:, at.F_FLAGS] >> at.OFFSET_SHIFT & at.OFFSET_MASK)
+
+
+def is_first(fac: I64) -> np.ndarray:
+    """Which rows (n,) are the first of a factor."""
+    return fac[:, at.F_KIND] != at.MEMBER
+
+
+def rows_of_factors(fac: I64, rows: I64) -> I64:
+    """All rows of the factors that begin at these rows, in their order."""
+    counts = np.maximum(fac[rows, at.F_FLAGS] >> at.ROWS_SHIFT, 1)
+    if (counts == 1).all():
+        return rows
+    return np.repeat(rows, counts) + np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def of_whole_factors(fac: I64, marked: np.ndarray) -> np.ndarray:
+    """`marked` (n,), where all rows of a factor are marked if any is."""
+    first = first_rows(fac)
+    of = np.zeros(len(fac), bool)
+    of[first[marked]] = True
+    return of[first]
+
+
+def ends_of_rows(fac: I64, rows: I64, arity: int) -> I64:
+    """(m, arity) variables of the factors that begin at these rows, which have so many."""
+    if arity <= 2:
+        return fac[rows, at.F_I : at.F_I + arity]
+    return np.column_stack([fac[rows, at.F_I], *(fac[rows + n, at.F_J] for n in range(arity - 1))])
+
+
+def mounts_of(fac: I64) -> I64:
+    """The variables that are mounts of sensors: the last of each factor of three variables."""
+    return np.unique(fac[np.flatnonzero(fac[:, at.F_FLAGS] >> at.ROWS_SHIFT) + 1, at.F_J])

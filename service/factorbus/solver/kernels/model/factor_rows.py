@@ -1,0 +1,65 @@
+"""The rows that a factor has in `fac`, and its variables.
+
+A factor of n > 2 variables has a row for each pair of them, (0, 1), (0, 2), …, (0, n−1), (1, 2), …, with the blocks
+of that pair in Λ.  So whatever follows from which variables are joined, such as order, fill, and which cliques a
+factor changes, is the same for all factors.  The first row has the kind, the measurement and the loss, and the first
+n − 1 rows name the variables.
+"""
+
+from factorbus.solver.kernels.jit.compile import I64, inline_kernel
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.sizes import arity_of
+
+
+@inline_kernel
+def loss_code(f: int, fac: I64) -> int:
+    """The code of the loss of factor f."""
+    return fac[f, at.F_FLAGS] >> at.LOSS_SHIFT & at.LOSS_MASK
+
+
+@inline_kernel
+def is_one_of_many(f: int, fac: I64) -> bool:
+    """Whether row f is of a factor of more than two variables."""
+    return fac[f, at.F_FLAGS] >> at.OFFSET_SHIFT != 0
+
+
+@inline_kernel
+def is_member(f: int, fac: I64) -> bool:
+    """Whether row f is a further one of a factor that begins before it."""
+    return fac[f, at.F_KIND] == at.MEMBER
+
+
+@inline_kernel
+def head_of(f: int, fac: I64) -> int:
+    """The first row of the factor that row f is of."""
+    return f - (fac[f, at.F_FLAGS] >> at.OFFSET_SHIFT & at.OFFSET_MASK)
+
+
+@inline_kernel
+def rows_of(f: int, fac: I64) -> int:
+    """How many rows the factor has that begins at row f."""
+    return max(fac[f, at.F_FLAGS] >> at.ROWS_SHIFT, 1)
+
+
+@inline_kernel
+def count_ends(f: int, fac: I64) -> int:
+    """How many variables the factor has that begins at row f."""
+    return arity_of(fac[f, at.F_KIND])
+
+
+@inline_kernel
+def end_of(f: int, n: int, fac: I64) -> int:
+    """The n-th variable of the factor that begins at row f."""
+    return fac[f, at.F_I] if n == 0 else fac[f + n - 1, at.F_J]
+
+
+@inline_kernel
+def row_of_pair(f: int, a: int, b: int, ends: int) -> int:
+    """The row of the variables a < b of the factor that begins at row f."""
+    return f + a * (2 * ends - a - 1) // 2 + b - a - 1
+
+
+@inline_kernel
+def count_rows(ends: int) -> int:
+    """How many rows a factor of so many variables has."""
+    return ends * (ends - 1) // 2 if ends > 2 else 1
