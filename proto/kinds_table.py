@@ -37,7 +37,7 @@ def found(text: str) -> str:
 def _ends(kind: FactorKind) -> str:
     poses = [VARIABLE_KINDS[end].is_pose for end in kind.connects]
     letters = ["x₁", "x₂"]
-    if kind.mounted:
+    if kind.base:
         letters = ["a", "b" if all(poses) else "l", "m"]
     elif len(poses) == 1:
         letters = ["x"]

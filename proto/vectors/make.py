@@ -65,6 +65,7 @@ def vectors() -> dict[str, bytes]:
         "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
         "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
         "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
+        "insert_mounts": codec.encode_insert(Insert(10, _mounts(), epoch=7)),
         "insert_linear_kinds": codec.encode_insert(Insert(9, _linear_kinds(), epoch=7)),
         "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, convert_below=0.1)),
         "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
@@ -202,6 +203,19 @@ def _linear_kinds() -> Batch:
         Factors("linear_se2", np.full((1, 1), plane[0]), np.array(pose[2:]), np.array([three])),
         Factors("linear_pair_se2_point2", np.array([plane]), np.array([pair]), two[None]),
     ]
+    return Batch(factors=tuple(groups))
+
+
+def _mounts() -> Batch:
+    """What sensors measure whose mount is a variable: the key of the mount is the last of each row."""
+    groups = []
+    for name, kind in FACTOR_KINDS.items():
+        if kind.base:
+            first, second = ("x", "l") if kind.connects[0] == "se2" else ("y", "p")
+            second = second if kind.connects[1].startswith("point") else first
+            keys = np.array([[symbol(first, 1), symbol(second, 2), symbol("m" if first == "x" else "n", 0)]])
+            unit = np.eye(kind.dim)[np.triu_indices(kind.dim)]
+            groups.append(Factors(name, keys, np.array([kind.example]), unit[None]))
     return Batch(factors=tuple(groups))
 
 

@@ -11,7 +11,7 @@ from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-MOUNTED = tuple(name for name, kind in FACTOR_KINDS.items() if kind.mounted)
+MOUNTED = tuple(name for name, kind in FACTOR_KINDS.items() if kind.base)
 PLANE_MOUNT, SPACE_MOUNT, CAMERA_MOUNT = (symbol(letter, 0) for letter in "mnk")
 _PIXEL = 0.01
 _NO_TURN = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -19,7 +19,7 @@ _NO_TURN = np.array([0, 0, 0, 0, 0, 0, 1.0])
 
 def random_mounted(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:
     """What a sensor of such a kind would measure at these values, with noise."""
-    of, seen = FACTOR_KINDS[kind].mounted, sensors(ends)
+    of, seen = FACTOR_KINDS[kind].base, sensors(ends)
     if of.startswith(("range", "bearing_se")):
         return random_other(of, seen, noise, rng)
     return measured(of, seen, noise, rng)

@@ -11,7 +11,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
 _BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se", "linear")
-OTHERS = tuple(name for name, kind in FACTOR_KINDS.items() if name.startswith(_BEGINNINGS) and not kind.mounted)
+OTHERS = tuple(name for name, kind in FACTOR_KINDS.items() if name.startswith(_BEGINNINGS) and not kind.base)
 
 
 def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:

@@ -178,7 +178,7 @@ def small_map(mode: str = "auto") -> Solver:
 def everything(solver: Solver) -> bytes:
     """All there is to see of a solver and of what it keeps, to the bit."""
     graph = graph_in(solver)
-    n, m, v, p, _, scalars, _ = graph.counts.tolist()
+    n, m, v, p, _, scalars, *_ = graph.counts.tolist()
     return pickle.dumps(
         [
             [

@@ -11,7 +11,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 
 def mounts_of(batch: Batch) -> I64:
     """The keys of the mounts: the last variables of factors of the kinds that have one."""
-    found = [group.keys[:, -1] for group in batch.factors if FACTOR_KINDS[group.kind].mounted]
+    found = [group.keys[:, -1] for group in batch.factors if FACTOR_KINDS[group.kind].base]
     return np.unique(np.concatenate([np.empty(0, np.int64), *found]))
 
 

@@ -196,5 +196,5 @@ _RESIDUALS: dict[str, Callable[..., F64]] = {
     **{kind: _linear(kind) for kind in (*LINEAR, *LINEAR_PAIRS)},
 }
 _RESIDUALS |= {
-    name: _at_mount(kind.mounted) for name, kind in FACTOR_KINDS.items() if kind.mounted and kind.mounted in _RESIDUALS
+    name: _at_mount(kind.base) for name, kind in FACTOR_KINDS.items() if kind.base and kind.base in _RESIDUALS
 }

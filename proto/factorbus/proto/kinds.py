@@ -26,7 +26,7 @@ class FactorKind:
     l of a point and y of a feature seen from pose a, m of a mount, and x, or x₁ and x₂, of others.
     example: a measurement, for the golden message of the kind
     half_angles: the last three rows of the residual are the vector part of a quaternion
-    mounted: the kind of which this is the one of a sensor whose mount on the robot, its last variable, is estimated
+    base: the kind that this is with the pose of a sensor, whose mount on the robot is the last variable
     """
 
     name: str
@@ -37,7 +37,7 @@ class FactorKind:
     residual: str
     example: tuple[float, ...]
     half_angles: bool = False
-    mounted: str = ""
+    base: str = ""
 
     def __post_init__(self) -> None:
         if len(self.example) != self.size:
@@ -100,9 +100,9 @@ def _linear(*ends: str) -> FactorKind:
     return FactorKind(name, ends, size, rows, measured, "H₁ (x₁ ⊟ y₁) + H₂ (x₂ ⊟ y₂) + b", example)
 
 
-def _with_mounts(kinds: tuple[FactorKind, ...]) -> tuple[FactorKind, ...]:
+def _and_with_mounts(kinds: tuple[FactorKind, ...]) -> tuple[FactorKind, ...]:
     """And those of a sensor whose mount is estimated: of all that one pose measures of another, or of a point."""
-    return (*kinds, *(_mounted(kind) for kind in kinds if kind.name in _WITH_MOUNT))
+    return (*kinds, *(_with_mount(kind) for kind in kinds if kind.name in _WITH_MOUNT))
 
 
 _WITH_MOUNT = (
@@ -111,14 +111,14 @@ _WITH_MOUNT = (
 )
 
 
-def _mounted(kind: FactorKind) -> FactorKind:
+def _with_mount(kind: FactorKind) -> FactorKind:
     """`kind` as measured by a sensor at m on the robot: with a ∘ m in place of the pose a."""
     instead = "a ∘ m and b ∘ m for a and b" if kind.connects[0] == kind.connects[1] else "a ∘ m for a"
     ends, residual = (*kind.connects, kind.connects[0]), f"that of {kind.name} with {instead}"
-    return replace(kind, name=f"{kind.name}_mount", connects=ends, residual=residual, mounted=kind.name)
+    return replace(kind, name=f"{kind.name}_mount", connects=ends, residual=residual, base=kind.name)
 
 
-_KINDS = _with_mounts(
+_KINDS = _and_with_mounts(
     (
         FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
         FactorKind(

@@ -10,7 +10,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import place_idp
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of, is_one_of_many
-from factorbus.solver.kernels.model.kinds import initializes, mounted_kind
+from factorbus.solver.kernels.model.kinds import base_kind, initializes
 from factorbus.solver.kernels.model.many import POSE, copy_pose, put_sensor
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.se2 import (
@@ -117,7 +117,7 @@ def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F
     """The same of the factor of more than two variables that begins at row f, for any of its rows: each waits for its
     two variables.  A mount follows from nothing, and all else from it.
     """
-    of, count, missing = mounted_kind(fac[f, at.F_KIND]), 0, -1
+    of, count, missing = base_kind(fac[f, at.F_KIND]), 0, -1
     if not initializes(of):
         return _NOTHING
     for n in range(count_ends(f, fac)):

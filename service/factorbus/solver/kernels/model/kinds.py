@@ -54,7 +54,7 @@ class FactorModel:
                   returns what χ² has beside rᵀ Ω r
     positive_at:  where in the measurement a number has to be above zero
     quaternions:  where in the measurement quaternions begin.  directions: and directions.  Both become unit
-    mounted:      the kind that it is of a sensor at a mount that is estimated (`many`); the residual is that kind's
+    base:         the kind that it is with the pose of a sensor, whose mount is a variable (`many`); and its residual
     """
 
     residual: Callable[..., Any]
@@ -69,7 +69,7 @@ class FactorModel:
     positive_at: int = -1
     quaternions: tuple[int, ...] = ()
     directions: tuple[int, ...] = ()
-    mounted: str = ""
+    base: str = ""
 
 
 def _usual(residual: Callable[..., Any], equation: str, rigid: bool = False, **more: Any) -> FactorModel:
@@ -121,17 +121,17 @@ FACTOR_MODELS = {
 }
 FACTOR_MODELS |= {
     name: FactorModel(
-        FACTOR_MODELS[kind.mounted].residual,
+        FACTOR_MODELS[kind.base].residual,
         "MATH (3.35)",
-        initializes=FACTOR_MODELS[kind.mounted].initializes,
-        lens_at=FACTOR_MODELS[kind.mounted].lens_at,
-        positive_at=FACTOR_MODELS[kind.mounted].positive_at,
-        quaternions=FACTOR_MODELS[kind.mounted].quaternions,
-        directions=FACTOR_MODELS[kind.mounted].directions,
-        mounted=kind.mounted,
+        initializes=FACTOR_MODELS[kind.base].initializes,
+        lens_at=FACTOR_MODELS[kind.base].lens_at,
+        positive_at=FACTOR_MODELS[kind.base].positive_at,
+        quaternions=FACTOR_MODELS[kind.base].quaternions,
+        directions=FACTOR_MODELS[kind.base].directions,
+        base=kind.base,
     )
     for name, kind in FACTOR_KINDS.items()
-    if kind.mounted
+    if kind.base
 }
 
 
@@ -141,7 +141,7 @@ def check_kinds() -> None:
     for name, model in FACTOR_MODELS.items():
         kind = FACTOR_KINDS[name]
         ends = [VARIABLE_KINDS[end] for end in kind.connects]
-        most = MOST_ENDS if model.mounted else 2
+        most = MOST_ENDS if model.base else 2
         if not 1 <= len(ends) <= most or max(kind.dim, *(end.dim for end in ends)) > _MOST:
             raise ImportError(
                 f"the factor kind {name!r} has {len(ends)} ends and a residual of the size {kind.dim}; "
@@ -185,13 +185,13 @@ CAMERA = _LENS_AT >= 0
 BOUNDED = np.array([model.bounded for model in _MODELS])
 POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])  # by the code of a kind of variables
 SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False])
-_MOUNTED = _table(at.FACTOR_CODES[model.mounted] if model.mounted else -1 for model in _MODELS)
+_BASE = _table(at.FACTOR_CODES[model.base] if model.base else -1 for model in _MODELS)
 
 
 @inline_kernel
-def mounted_kind(kind: int) -> int:
+def base_kind(kind: int) -> int:
     """The kind that it is of a sensor at a mount that is estimated; −1: of none."""
-    return _MOUNTED[kind]
+    return _BASE[kind]
 
 
 @inline_kernel
@@ -254,7 +254,7 @@ def direction_at(kind: int, n: int) -> int:
     return _DIRECTIONS[kind, n]
 
 
-_alone = {name: model for name, model in FACTOR_MODELS.items() if not model.mounted}
+_alone = {name: model for name, model in FACTOR_MODELS.items() if not model.base}
 _common = {name: model for name, model in _alone.items() if model.common}
 _others = {name: model for name, model in _alone.items() if not model.common}
 _other_residual_of = inline_kernel(dispatcher("other_residual_of", _others))

@@ -17,7 +17,7 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, loss_code
-from factorbus.solver.kernels.model.kinds import mounted_kind, residual_of
+from factorbus.solver.kernels.model.kinds import base_kind, residual_of
 from factorbus.solver.kernels.model.losses import loss_of
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import compose_se2
@@ -102,7 +102,7 @@ def at_mount(kind: int, x: F64, places: I64, p: F64, k: int, many: Many) -> floa
 
     places: where the values of the variables begin in x; the measurement is at p[k].
     """
-    of, m, dim = mounted_kind(kind), places[2], residual_dim(kind)
+    of, m, dim = base_kind(kind), places[2], residual_dim(kind)
     planar = kind_of_end(kind, 0) == at.SE2
     joins_poses = kind_of_end(kind, 1) == kind_of_end(kind, 0)
     A, B, y = np.zeros((6, 6)), np.zeros((6, 6)), np.empty(3 * POSE)
