@@ -7,14 +7,22 @@ import click
 
 from factorbus.cli.output.exits import output_file
 from factorbus.cli.process.options import file_argument, json_option
-from factorbus.cli.process.reading import COUNTED, IDS, read_graph, reading_options, robot_option, say
+from factorbus.cli.process.reading import (
+    COUNTED,
+    GRAPHS,
+    IDS,
+    check_chosen,
+    read_graph,
+    reading_options,
+    robot_option,
+    say,
+)
 from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from factorbus.formats import GraphFile
 
-_GRAPHS = (".g2o", ".pyfg")
-_WRITES = (*_GRAPHS, ".tum", ".kitti")
+_WRITES = (*GRAPHS, ".tum", ".kitti")
 
 
 @click.command()
@@ -49,12 +57,7 @@ def command(
         raise click.BadParameter(
             f"{target} does not end in {' or '.join((', '.join(_WRITES[:-1]), _WRITES[-1]))}", param_hint="TARGET"
         )
-    if ids is not None and target.suffix == ".pyfg":
-        raise click.UsageError("--ids is of a .g2o: a .pyfg has the names of the keys")
-    if ids is not None and target.suffix != ".g2o":
-        raise click.UsageError("--ids is of a .g2o: a trajectory has times instead")
-    if robot is not None and target.suffix in _GRAPHS:
-        raise click.UsageError(f"--robot is of trajectories: a {target.suffix} has the whole graph")
+    check_chosen(target, robot, ids)
     from factorbus.cli.output.console import document, print_note
 
     graph = read_graph(source, dialect, strict, whole=True)
@@ -73,11 +76,11 @@ def _check_any(graph: "GraphFile", target: Path) -> None:
     """Raises FormatError where nothing of `graph` would be in `target`."""
     from factorbus.formats import FormatError
 
-    if target.suffix in _GRAPHS and not (graph.batch.variable_count or graph.batch.factor_count):
+    if target.suffix in GRAPHS and not (graph.batch.variable_count or graph.batch.factor_count):
         raise FormatError(
             graph.path, None, f"nothing that a {target.suffix} would have", "at least one vertex or edge that is read"
         )
-    if target.suffix not in _GRAPHS and not graph.poses:
+    if target.suffix not in GRAPHS and not graph.poses:
         raise FormatError(graph.path, None, f"no pose, and a {target.suffix} has nothing else", "at least one pose")
 
 
