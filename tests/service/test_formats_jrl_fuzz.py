@@ -1,5 +1,6 @@
 """JRL files that were damaged on the way are read or refused with FormatError, never anything else."""
 
+import copy
 import json
 from typing import Any
 
@@ -33,7 +34,7 @@ def parts(value: Any) -> list[tuple[Any, Any]]:
 @st.composite
 def damaged(draw: st.DrawFn) -> bytes:
     """A good file after a few changes: values replaced, doubled, lost, swapped or renamed, and of bytes."""
-    document = json.loads(json.dumps(draw(st.sampled_from(DOCUMENTS))))
+    document = copy.deepcopy(draw(st.sampled_from(DOCUMENTS)))
     for _ in range(draw(st.integers(1, 4))):
         there = parts(document)
         if not there:
@@ -41,13 +42,13 @@ def damaged(draw: st.DrawFn) -> bytes:
         (of, key), (other, its) = draw(st.sampled_from(there)), draw(st.sampled_from(there))
         match draw(st.sampled_from(["replace", "take", "drop", "repeat", "rename"])):
             case "replace":
-                of[key] = draw(LEAVES)
+                of[key] = copy.deepcopy(draw(LEAVES))  # the strategy gives the same lists again
             case "take":
-                of[key] = json.loads(json.dumps(other[its]))
+                of[key] = copy.deepcopy(other[its])
             case "drop":
                 del of[key]
             case "repeat" if isinstance(of, list):
-                of.append(json.loads(json.dumps(of[key])))
+                of.append(copy.deepcopy(of[key]))
             case "rename" if isinstance(of, dict):
                 of[draw(st.sampled_from(NAMES))] = of.pop(key)
             case _:

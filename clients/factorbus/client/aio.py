@@ -259,7 +259,7 @@ class Map:
         strict: bool = False,
         ids: str = "auto",
     ) -> str:
-        """The map as the text of a file: "g2o", "pyfg", "tum" or "kitti", as in `Map.export`.
+        """The map as the text of a file: "g2o", "pyfg", "jrl", "tum" or "kitti", as in `Map.export`.
 
         Raises Refused, Unavailable.
         """

@@ -298,10 +298,10 @@ class Map:
         strict: bool = False,
         ids: str = "auto",
     ) -> str:
-        """The map as the text of a file: "g2o", "pyfg", "tum" or "kitti".
+        """The map as the text of a file: "g2o", "pyfg", "jrl", "tum" or "kitti".
 
         robot: the letter of the robot whose trajectory it is ("" for keys without one), if the map has several.  What
-        g2o or pyfg has no record for is left out and logged, and with `strict` refused; `ask.export` gives it as notes.
+        a form has no record for is left out and logged, and with `strict` refused; `ask.export` gives it as notes.
         ids: of a g2o file, "auto" (numbers if x and l are all the letters, else keys), "ids", "keys" or "counted".
         Raises Refused, Unavailable.
         """

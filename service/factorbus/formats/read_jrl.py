@@ -95,10 +95,11 @@ def read_jrl(file: str, content: bytes, left: LeftOut) -> tuple[Batch, tuple[I64
         vertices, known = ([_vertices(file, *each) for each in of.rows.items()] for of in (values, truth))
         batch, turns = assembled(file, True, False, vertices, edges, None)
     name = document.find("name")
+    true = Batch(tuple(Variables(of.kind, of.ids, of.values) for of in known))
     log = RobotLog(
         "" if name is None else name.text(),
         _labels(document, entries, rows, turns),
-        tuple(Variables(of.kind, of.ids, of.values) for of in known),
+        _stamped(true, entries, rows, {**values.stamps, **truth.stamps}).variables,
     )
     if told := log.told():
         left.say(told)

@@ -26,7 +26,9 @@ class FactorLabels:
 
 @dataclass(frozen=True, slots=True)
 class RobotLog:
-    """name: of the data set.  labels: one for each group of factors of the graph, or none.  ground_truth: values."""
+    """name: of the data set.  labels: one for each group of factors of the graph, or none.  ground_truth: values
+    and time stamps.
+    """
 
     name: str
     labels: tuple[FactorLabels, ...]

@@ -27,7 +27,13 @@ def write_graph(
     if ending == ".jrl":
         return write_jrl(path, batch, strict, log)
     left = LeftOut(str(path), strict)
-    for name, count in (log.counts() if log else {}).items():
-        left.drop(name.replace("_", " "), count, f"{ending.removeprefix('.')} has no place for it")
+    if log is not None:
+        beside = {
+            "ground truth values": log.known,
+            "potential outliers": log.potential_outliers,
+            "outliers": log.outliers,
+        }
+        for name, count in beside.items():
+            left.drop(name, count, f"{ending.removeprefix('.')} has no place to say so; the graph is whole")
     written = write_g2o(path, batch, strict, ids) if ending == ".g2o" else write_pyfg(path, batch, strict)
     return (*left.notes, *written)

@@ -116,12 +116,12 @@ def _measurements(batch: Batch, robots: Mapping[int, str], log: RobotLog | None)
         labels = log.labels[number] if log and log.labels else None
         for row, (keys, record) in enumerate(zip(group.keys.tolist(), _records(group), strict=True)):
             last = max(keys, key=lambda key: turn.get(key, -1))
-            if labels is None:
-                stamp = times.get(last, 0)
-                yield _Measurement(robots[last], stamp, 0 if times else turn.get(last, 0), keys, record)
-            else:
-                flags = bool(labels.potential[row]), bool(labels.outlier[row])
-                yield _Measurement(chr(labels.robots[row]), int(labels.stamps[row]), 0, keys, record, *flags)
+            robot, stamp = robots[last], times.get(last, 0)
+            potential = outlier = False
+            if labels is not None:
+                robot, stamp = chr(labels.robots[row]), int(labels.stamps[row])
+                potential, outlier = bool(labels.potential[row]), bool(labels.outlier[row])
+            yield _Measurement(robot, stamp, 0 if stamp else turn.get(last, 0), keys, record, potential, outlier)
 
 
 def _times(group: Variables) -> Iterator[tuple[int, int | None]]:

@@ -31,8 +31,8 @@ _WRITES = (*GRAPHS, ".tum", ".kitti")
 def command(
     name: str, target: Path, robot: str | None, ids: str | None, endpoint: str, zenoh: str, timeout_s: float
 ) -> None:
-    """Write MAP as it is now into FILE: the whole graph as .g2o or .pyfg, or trajectories as .tum or .kitti, by its
-    ending.
+    """Write MAP as it is now into FILE: the whole graph as .g2o, .pyfg or .jrl, or trajectories as .tum or
+    .kitti, by its ending.
 
     A trajectory is of one robot, the letter of its poses' keys. Of several each gets a file of its own: out.tum becomes
     out-a.tum and out-b.tum. Its times are the poses' time stamps, and where no pose has one the numbers of their keys;

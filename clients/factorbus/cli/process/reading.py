@@ -15,7 +15,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 DIALECTS = ("g2o", "toro", "isam", "slam++", "pyfg", "jrl", "tum")
 COUNTED = (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))  # of a graph, and of one of them
 IDS = ("auto", "ids", "keys", "counted")
-GRAPHS = (".g2o", ".pyfg")  # endings of files that are written with the whole graph; the others are trajectories
+GRAPHS = (".g2o", ".pyfg", ".jrl")  # endings of files that are written with the whole graph; others are trajectories
 
 
 def reading_options(command: F) -> F:

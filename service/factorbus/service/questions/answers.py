@@ -25,7 +25,7 @@ from factorbus.service.questions.uncertainty import DECODE, MissingVariables, Un
 from factorbus.solver.changes.repair import repair
 from factorbus.solver.errors import SolverError
 
-_GRAPHS, _TRAJECTORIES = ("g2o", "pyfg"), ("tum", "kitti")
+_GRAPHS, _TRAJECTORIES = ("g2o", "pyfg", "jrl"), ("tum", "kitti")
 _IDS = ("auto", "ids", "keys", "counted")
 _WAIT_S = (0.001, 86_400.0)
 # How many times the bytes of the solver it takes to repair a map, and to factorize one in a mode that keeps no R.
@@ -287,11 +287,14 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
 def _text(question: Question, batch: Batch) -> tuple[str, list[str]]:
     """(the file, what was left out of it).  Raises FormatError, SeveralRobots."""
     # Only who asks for an export pays for it.
-    from factorbus.formats import as_g2o, as_pyfg, kitti_text, tum_notes, tum_text
+    from factorbus.formats import as_g2o, as_jrl, as_pyfg, kitti_text, tum_notes, tum_text
 
     if question.format in _GRAPHS:
         strict = question.strict
-        written = as_g2o(batch, strict, question.ids) if question.format == "g2o" else as_pyfg(batch, strict)
+        if question.format == "g2o":
+            written = as_g2o(batch, strict, question.ids)
+        else:
+            written = {"pyfg": as_pyfg, "jrl": as_jrl}[question.format](batch, strict)
         return written.text, list(written.notes)
     if question.format == "tum":
         return tum_text(batch, question.robot), list(tum_notes(batch, question.robot))
