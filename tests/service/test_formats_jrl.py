@@ -7,7 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from jrl_logs import A0, A1, B0, COVARIANCE6, L0, PLANE, SPACE, T0, read_text
+from jrl_logs import A0, A1, B0, COVARIANCE6, L0, L1, PLANE, SPACE, T0, read_text
 from naive.dense_factors import residual
 
 from factorbus.formats import FormatError, GraphFile, read
@@ -65,6 +65,45 @@ def test_what_a_log_has_beside_the_graph(tmp_path: Path) -> None:
     assert graph.notes == (
         "ground truth of 3 variables; labels: 3 potential outliers, 1 outlier; they are factors as all others",
     )
+
+
+def test_the_plane_is_weighed_as_gtsam_does(tmp_path: Path) -> None:
+    batch = read_text(tmp_path, PLANE).batch
+    start, rng = gtsam.Pose2(0.5, 0, 0.25), np.random.default_rng(5)
+    true = {A0: start, A1: start.compose(gtsam.Pose2(1, 0.25, 0.5)), B0: start.compose(gtsam.Pose2(3, 4, 0))}
+    values, at = gtsam.Values(), {L0: np.array([4.0, -1.0]), L1: np.array([7.0, 1.5])}
+    for key, pose in true.items():  # near what was measured, where all charts of a pose are the same
+        values.insert(key, near := pose.compose(gtsam.Pose2(*1e-5 * rng.normal(size=3))))
+        at[key] = np.array([near.x(), near.y(), near.theta()])
+    for key in (L0, L1):
+        values.insert(key, at[key])
+
+    def noise(*rows: list[float]) -> gtsam.noiseModel.Gaussian:
+        return gtsam.noiseModel.Gaussian.Covariance(np.array(rows))
+
+    moved = noise([0.01, 0, 0], [0, 0.04, 0], [0, 0, 0.0025])
+    wanted = {
+        "prior_se2": [
+            gtsam.PriorFactorPose2(
+                A0, gtsam.Pose2(0.5, 0, 0.25), noise([0.01, 0.002, 0], [0.002, 0.04, 0], [0, 0, 0.0025])
+            )
+        ],
+        "between_se2": [
+            gtsam.BetweenFactorPose2(A0, B0, gtsam.Pose2(3, 4, 0), noise([1, 0, 0], [0, 1, 0], [0, 0, 1])),
+            gtsam.BetweenFactorPose2(A0, A1, gtsam.Pose2(1, 0.25, 0.5), moved),
+        ],
+        "bearing_range_se2": [gtsam.BearingRangeFactor2D(A1, L0, gtsam.Rot2(-0.5), 4, noise([0.0001, 0], [0, 0.25]))],
+        "range_se2": [gtsam.RangeFactor2D(A1, L1, 6.5, noise([0.0625]))],
+        "range_between_se2": [gtsam.RangeFactorPose2(A0, B0, 5, noise([0.25]))],
+        "prior_point2": [gtsam.PriorFactorPoint2(L1, np.array([7.0, 1.0]), noise([1, 0.5], [0.5, 1]))],
+    }
+    assert {group.kind for group in batch.factors} == set(wanted)
+    for group in batch.factors:
+        for keys, z, packed, of in zip(group.keys, group.measured, group.information, wanted[group.kind], strict=True):
+            r = residual(group.kind, [at[key] for key in keys.tolist()], z)
+            full = np.zeros((len(r), len(r)))
+            full[np.triu_indices(len(r))] = packed
+            assert r @ (full + np.triu(full, 1).T) @ r == pytest.approx(2 * of.error(values), rel=1e-3), group.kind
 
 
 def pose3(row: np.ndarray) -> gtsam.Pose3:

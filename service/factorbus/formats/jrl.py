@@ -44,10 +44,10 @@ GTSAM_ORDER = (3, 4, 5, 0, 1, 2)
 
 def measured_numbers(name: str, part: Part) -> list[float]:
     """What a factor of that name has measured, in our order.  Raises FormatError."""
-    return numbers_of(_MEASURED[name], part)
+    return value_numbers(_MEASURED[name], part)
 
 
-def numbers_of(name: str, part: Part) -> list[float]:
+def value_numbers(name: str, part: Part) -> list[float]:
     """The numbers of a value of that name, in our order.  Raises FormatError."""
     if name in (SCALAR, ROT2) and not isinstance(part.value, dict):
         return [part.number()]
@@ -58,7 +58,7 @@ def numbers_of(name: str, part: Part) -> list[float]:
         w, x, y, z = part.member("rotation").numbers(4)
         return [*part.member("translation").numbers(3), x, y, z, w]
     if name == BEARING_RANGE:
-        bearing, distance = numbers_of(ROT2, part.member("bearing")), numbers_of(SCALAR, part.member("range"))
+        bearing, distance = value_numbers(ROT2, part.member("bearing")), value_numbers(SCALAR, part.member("range"))
         return bearing + distance
     return [part.member(field).number() for field in _FIELDS[name]]
 

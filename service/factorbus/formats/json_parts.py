@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from factorbus.formats.errors import FormatError
+from factorbus.wording import counted
 
 _MOST_SHOWN = 40
 
@@ -69,8 +70,8 @@ class Part:
         """`count` finite numbers.  Raises FormatError."""
         if not isinstance(self.value, list) or len(self.value) != count:
             seen = f"an array of {len(self.value)}" if isinstance(self.value, list) else None
-            raise self.refused(f"an array of {count} numbers", seen)
-        return self._finite(self.value, f"an array of {count} finite numbers")
+            raise self.refused(f"an array of {counted(count, 'number')}", seen)
+        return self._finite(self.value, f"an array of {counted(count, 'finite number')}")
 
     def _finite(self, values: list[Any], wanted: str) -> list[float]:
         found = []

@@ -18,7 +18,7 @@ from factorbus.formats.jrl import (
     PRIORS,
     VALUES,
     measured_numbers,
-    numbers_of,
+    value_numbers,
 )
 from factorbus.formats.json_parts import Part, abridged, parsed_json
 from factorbus.formats.left_out import LeftOut
@@ -163,7 +163,7 @@ def _values(document: Part, what: str, places: list[Part], left: LeftOut) -> _Va
         if name not in VALUES:
             foreign[name].append(part)
             continue
-        numbers = numbers_of(name, part)
+        numbers = value_numbers(name, part)
         before, its, where = seen.setdefault(key, (name, numbers, part))
         if (before, its) != (name, numbers):
             raise part.refused("one value for a key", f"{format_symbol(key)} again, other than at {where.place}")
