@@ -2,8 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from factorbus.formats.errors import FormatError
 from factorbus.wording import counted
@@ -11,9 +10,11 @@ from factorbus.wording import counted
 _MOST_SHOWN = 40
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
-    """A value of a JSON file, and its place there, such as `measurements.a[3].stamp`; "" for the whole."""
+class Part(NamedTuple):
+    """A value of a JSON file, and its place there, such as `measurements.a[3].stamp`; "" for the whole.
+
+    A file has as many as numbers: a frozen dataclass takes three times as long to make.
+    """
 
     file: str
     place: str
