@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jrl_logs import A0, A1, A2, B0, B1, L0, PLANE, SPACE, T0, read_text
 
-from factorbus.formats import FormatError, GraphFile, as_jrl, read, write_jrl
+from factorbus.formats import GRAPHS, FormatError, GraphFile, as_jrl, read, write_graph, write_jrl
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
@@ -157,6 +157,24 @@ def test_what_jrl_has_no_record_for_is_left_out_and_said() -> None:
         as_jrl(batch, strict=True)
     with pytest.raises(FormatError, match="the key -7; wanted keys from 0"):
         as_jrl(Batch((Variables("se2", np.array([-7]), np.zeros((1, 3))),)))
+
+
+@pytest.mark.parametrize("ending", GRAPHS)
+def test_the_ending_says_the_form_and_what_has_no_place_in_it_is_said(tmp_path: Path, ending: str) -> None:
+    graph = read_text(tmp_path, PLANE)
+    path = tmp_path / f"b{ending}"
+    notes = write_graph(path, graph.batch, log=graph.log)
+    form = ending.removeprefix(".")
+    assert read(path).dialect == form
+    lost = [
+        f"3 {name} left out: {form} has no place to say so" for name in ("ground truth values", "potential outliers")
+    ]
+    assert [any(note.startswith(each) for note in notes) for each in lost] == [ending != ".jrl"] * 2
+    if ending != ".jrl":
+        with pytest.raises(FormatError, match="strict"):
+            write_graph(path, graph.batch, strict=True, log=graph.log)
+    with pytest.raises(FormatError, match=r"the ending '\.xyz'; wanted one of \.g2o, \.pyfg, \.jrl"):
+        write_graph(tmp_path / "b.xyz", graph.batch)
 
 
 def test_a_replay_takes_a_late_closure_when_its_entry_comes(tmp_path: Path) -> None:
