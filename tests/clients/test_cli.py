@@ -84,7 +84,7 @@ def test_version_names_the_libraries() -> None:
         (["replay", "broken.g2o", "--in-process"], BAD_FILE, "broken.g2o:2: "),
         (["replay", "one.g2o", "--connect", "tcp/127.0.0.1:9", "--timeout", "0.1"], UNAVAILABLE, "[unavailable]"),
         (["replay", "one.g2o", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
-        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o, .pyfg, .tum or .kitti"),
+        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o, .pyfg, .jrl, .tum or .kitti"),
         (["convert", "broken.g2o", "one.tum"], BAD_FILE, "broken.g2o:2: "),
         (["simulate", "manhattan"], USAGE, "there is nothing to write"),
         (["simulate", "atlantis", "--out", "a.g2o"], USAGE, "atlantis"),
@@ -119,7 +119,7 @@ def test_with_json_a_failure_is_one_document_too(tmp_path: Path) -> None:
         "file": "missing.g2o",
         "line": None,
         "seen": "it cannot be read (No such file or directory)",
-        "wanted": "a readable g2o, TORO, iSAM, SLAM++ or PyFactorGraph file",
+        "wanted": "a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file",
     }
 
 

@@ -11,7 +11,7 @@ from factorbus.cli.driving.columns import merged
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import BAD_FILE, OK, REFUSED, USAGE
 from factorbus.cli.process import reading
-from factorbus.formats import IDS, READS, GraphFile, read
+from factorbus.formats import GRAPHS, IDS, READS, GraphFile, read
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
@@ -41,6 +41,7 @@ def robots() -> str:
 def test_the_options_are_those_of_the_reader_and_the_writer() -> None:
     assert set(reading.DIALECTS) == set(READS)
     assert set(reading.IDS) == set(IDS) - {"apart"}
+    assert reading.GRAPHS == GRAPHS
 
 
 def test_convert_says_what_it_leaves_out(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -217,6 +218,29 @@ def test_a_replay_says_how_the_file_was_read(folder: Path, capsys: pytest.Captur
         assert main(["replay", "a.txt", "--in-process", "--json", "--mode", "inc-l", *more]) == OK
         chi2.append(json.loads(capsys.readouterr().out)["chi2"])
     assert chi2[0] > 40 * chi2[1]
+
+
+def test_a_robot_log_is_replayed_converted_and_held_against_its_truth(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", "manhattan", "--poses", "12", "--out", "a.jrl", "--truth", "truth.tum"]) == OK
+    assert main(["convert", "a.jrl", "b.tum", "--ground-truth"]) == OK
+    assert (folder / "b.tum").read_text() == (folder / "truth.tum").read_text()
+    assert main(["convert", "a.jrl", "b.jrl", "--strict"]) == OK
+    assert "a.jrl: ground truth of 12 variables" in capsys.readouterr().err
+    assert (folder / "b.jrl").read_text() == (folder / "a.jrl").read_text()
+    asked = ["replay", "a.jrl", "--in-process", "--mode", "inc-l", "--json", "--out", "c.jrl", "--plot", "c.png"]
+    assert main(asked) == OK
+    told = json.loads(capsys.readouterr().out)
+    assert (told["read"]["ground_truth"], told["error_m"]["poses"]) == (12, 12)
+    assert 0 < told["error_m"]["rms"] < told["error_m"]["max"] < 1
+    assert read(folder / "c.jrl").account()["ground_truth"] == 12
+    assert main(["convert", "a.jrl", "d.g2o"]) == OK
+    assert "12 ground truth values left out: g2o has no place to say so" in capsys.readouterr().err
+    assert main(["convert", "a.jrl", "d.g2o", "--strict"]) == BAD_FILE
+    assert main(["convert", "a.jrl", "d.g2o", "--ground-truth"]) == USAGE
+    assert main(["convert", "d.g2o", "d.tum", "--ground-truth"]) == BAD_FILE
+    assert "d.g2o: no ground truth; wanted a .jrl with its groundtruth" in capsys.readouterr().err
 
 
 def test_ranges_go_from_pyfg_to_pyfg_and_through_a_replay(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

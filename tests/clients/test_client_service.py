@@ -100,6 +100,8 @@ def test_a_loop_is_closed_over_the_bus(service: Service) -> None:
         assert loop.stats()["revision"] == settled.revision
         assert loop.export("g2o").count("EDGE_SE2") == 5
         assert len(loop.export("tum").splitlines()) == 5
+        assert loop.export("pyfg").count("EDGE_SE2 ") == 5
+        assert loop.export("jrl").count("BetweenFactorPose2") == 5
         assert [row.variables for row in bus.maps() if row.name == "loop"] == [5]
         bus.drop("loop")
         assert not [row for row in bus.maps() if row.name == "loop"]

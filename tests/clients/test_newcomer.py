@@ -16,6 +16,7 @@ from factorbus.cli.output.exits import BAD_FILE, FAILED, OK, REFUSED, UNAVAILABL
 from factorbus.cli.output.starts import ratio_to
 from factorbus.cli.process.bus import open_bus
 from factorbus.client import Draft, connect
+from factorbus.formats import read
 from factorbus.proto.problems import NobodyListens
 from factorbus.proto.version import __version__
 
@@ -104,6 +105,10 @@ def test_a_map_is_saved_whole_or_the_way_of_each_robot(
     whole, way = tmp_path / "yard.g2o", tmp_path / "way.tum"
     assert save(str(whole)) == [str(whole)]
     assert whole.read_text().count("EDGE_SE2") == 9
+    others = [tmp_path / f"yard.{form}" for form in ("pyfg", "jrl")]
+    for other in others:
+        assert save(str(other)) == [str(other)]
+        assert read(other).batch.factor_count == 9
     assert save(str(way), "--robot", "a") == [str(way)]
     assert [float(line.split()[2]) for line in way.read_text().splitlines()] == [97.0] * 4
     each = save(str(tmp_path / "all.kitti"))
@@ -112,7 +117,9 @@ def test_a_map_is_saved_whole_or_the_way_of_each_robot(
     assert main(["save", "yard", str(way), "--robot", "q", "--connect", endpoint]) == REFUSED
     assert "there are keys without a letter, a, b" in capsys.readouterr().err
     assert main(["save", "yard", str(tmp_path / "a.xyz"), "--connect", endpoint]) == USAGE
-    assert main(["save", "yard", str(whole), "--robot", "a", "--connect", endpoint]) == USAGE
+    for graph in (whole, *others):
+        assert main(["save", "yard", str(graph), "--robot", "a", "--connect", endpoint]) == USAGE
+    assert main(["save", "yard", str(others[0]), "--ids", "keys", "--connect", endpoint]) == USAGE
     assert save(str(tmp_path / "counted.g2o"), "--ids", "counted") == [str(tmp_path / "counted.g2o")]
     counted = [int(line.split()[1]) for line in (tmp_path / "counted.g2o").read_text().splitlines() if "VERTEX" in line]
     assert sorted(counted) == list(range(12))

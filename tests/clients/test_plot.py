@@ -148,6 +148,16 @@ def test_pictures_of_a_file(arguments: list[str], town: Path, tmp_path: Path, ca
     assert ("95 % of where it may be (9)" in text) == ("--ellipses" in arguments)
 
 
+def test_a_log_that_knows_the_truth_has_it_in_the_picture(tmp_path: Path) -> None:
+    log, svg = tmp_path / "town.jrl", tmp_path / "town.svg"
+    assert main(["simulate", "manhattan", "--poses", "30", "--out", str(log)]) == OK
+    assert main(["plot", "map", str(log), "--out", str(svg)]) == OK
+    assert ">truth<" in svg.read_text()
+    assert main(["convert", str(log), str(tmp_path / "town.g2o")]) == OK
+    assert main(["plot", "map", str(tmp_path / "town.g2o"), "--out", str(svg)]) == OK
+    assert ">truth<" not in svg.read_text()
+
+
 def test_pictures_say_where_an_optimum_had_not_converged(town: Path, tmp_path: Path, monkeypatch) -> None:
     """Also with the picture of a drive."""
     svg = tmp_path / "picture.svg"

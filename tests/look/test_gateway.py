@@ -70,7 +70,8 @@ def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None
             assert group.get("stamps") == times, "as text, which JavaScript does not round"
         assert sum(len(group["keys"]) for group in get(f"{root}/graph")["factors"]) == graph.factor_count
         assert get(f"{root}/stats")["factors"] == graph.factor_count
-        assert get(f"{root}/export?format=kitti") == joined.export("kitti")
+        for form in ("kitti", "pyfg", "jrl"):
+            assert get(f"{root}/export?format={form}") == joined.export(form)
         # Each factor is counted with each of its variables: the sum over variables is arity times χ².
         explained = [
             get(f"{root}/variables/{format_symbol(key)}")

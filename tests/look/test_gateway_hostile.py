@@ -32,7 +32,8 @@ PIECES = (
     "fuzzed?x", "%F0%9F%98%80", "\u00e9", "~", "index.html", "CON", "x0%0d%0aSet-Cookie:a",
 )  # fmt: skip
 QUERIES = (
-    "", "?", "?format=g2o", "?format=tum", "?format=kitti", "?format=", "?format=png", "?format=%00", "?format=%ff",
+    "", "?", "?format=g2o", "?format=tum", "?format=kitti", "?format=pyfg", "?format=jrl", "?format=", "?format=png",
+    "?format=%00", "?format=%ff",
     "?format=g2o&format=tum", "?" + "a" * 5000, "?format=" + "g" * 3000, "?%=%", "?a[]=1", "?format=%0d%0aX:%20y",
 )  # fmt: skip
 HEADERS = (

@@ -148,6 +148,8 @@ def test_stats_do_not_wait_for_the_solver(core: MapCore) -> None:
         ("export", codec.encode_map({"format": "pdf"}), "bad_option"),
         ("export", codec.encode_map({"format": "tum", "strict": True}), "bad_option"),
         ("export", codec.encode_map({"format": "kitti", "ids": "keys"}), "bad_option"),
+        ("export", codec.encode_map({"format": "pyfg", "ids": "keys"}), "bad_option"),
+        ("export", codec.encode_map({"format": "jrl", "robot": "a"}), "bad_option"),
         ("graph", b"\x93\x01\x02\x03", "bad_message"),
     ],
 )

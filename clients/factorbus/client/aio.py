@@ -259,7 +259,10 @@ class Map:
         strict: bool = False,
         ids: str = "auto",
     ) -> str:
-        """The map as the text of a file: "g2o", "tum" or "kitti", as in `Map.export`.  Raises Refused, Unavailable."""
+        """The map as the text of a file: "g2o", "pyfg", "jrl", "tum" or "kitti", as in `Map.export`.
+
+        Raises Refused, Unavailable.
+        """
         exported = await asyncio.wrap_future(self._map.ask.export(format, timeout_s, robot, strict, ids))
         return logged(self._map.name, exported)
 

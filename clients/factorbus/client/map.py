@@ -298,11 +298,11 @@ class Map:
         strict: bool = False,
         ids: str = "auto",
     ) -> str:
-        """The map as the text of a file: "g2o", "tum" or "kitti".
+        """The map as the text of a file: "g2o", "pyfg", "jrl", "tum" or "kitti".
 
         robot: the letter of the robot whose trajectory it is ("" for keys without one), if the map has several.  What
-        g2o has no record for is left out and logged, and with `strict` refused; `ask.export` gives it as notes.  ids:
-        of a g2o file, "auto" (numbers if x and l are all the letters, else keys), "ids", "keys" or "counted".
+        a form has no record for is left out and logged, and with `strict` refused; `ask.export` gives it as notes.
+        ids: of a g2o file, "auto" (numbers if x and l are all the letters, else keys), "ids", "keys" or "counted".
         Raises Refused, Unavailable.
         """
         return logged(self.name, self.ask.export(format, timeout_s, robot, strict, ids).result())

@@ -7,7 +7,7 @@
 | /api/maps/NAME/estimate, /graph, /stats, /closures, /ellipses | JSON |
 | /api/maps/NAME/variables/KEY | what holds x12 where it is |
 | /api/maps/NAME/optimum | χ² beside the optimum from scratch, whether that converged, a notice where it is better |
-| /api/maps/NAME/export?format=g2o | text, also `tum` and `kitti`, of several robots with `&robot=a` |
+| /api/maps/NAME/export?format=g2o | text, also `pyfg`, `jrl`, `tum` and `kitti`, of several robots with `&robot=a` |
 | /api/maps/NAME/live | WebSocket: the estimate, then what each step changed |
 """
 

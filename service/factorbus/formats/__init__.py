@@ -1,5 +1,5 @@
-"""Graph files in and out: g2o, TORO, iSAM, SLAM++, PyFactorGraph and TUM text are read,
-g2o, PyFactorGraph, TUM and KITTI are written.
+"""Graph files in and out: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL and TUM text are read,
+g2o, PyFactorGraph, JRL, TUM and KITTI are written.
 
 `read` gives a `GraphFile`: the whole graph as one `Batch`, and its replay as one `Batch` a pose, in time order.
 """
@@ -8,21 +8,28 @@ from factorbus.formats.errors import FormatError
 from factorbus.formats.graph import GraphFile
 from factorbus.formats.numbering import IDS
 from factorbus.formats.reader import READS, read
+from factorbus.formats.robot_log import FactorLabels, RobotLog
 from factorbus.formats.steps import Steps
 from factorbus.formats.writable import Written
 from factorbus.formats.write_g2o import as_g2o, g2o_text, write_g2o
+from factorbus.formats.write_graph import GRAPHS, write_graph
+from factorbus.formats.write_jrl import as_jrl, write_jrl
 from factorbus.formats.write_kitti import kitti_text, write_kitti
 from factorbus.formats.write_pyfg import as_pyfg, write_pyfg
 from factorbus.formats.write_tum import tum_notes, tum_text, write_tum
 
 __all__ = [
+    "GRAPHS",
     "IDS",
     "READS",
+    "FactorLabels",
     "FormatError",
     "GraphFile",
+    "RobotLog",
     "Steps",
     "Written",
     "as_g2o",
+    "as_jrl",
     "as_pyfg",
     "g2o_text",
     "kitti_text",
@@ -30,6 +37,8 @@ __all__ = [
     "tum_notes",
     "tum_text",
     "write_g2o",
+    "write_graph",
+    "write_jrl",
     "write_kitti",
     "write_pyfg",
     "write_tum",

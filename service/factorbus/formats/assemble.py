@@ -12,7 +12,7 @@ from factorbus.proto.symbols import symbol
 
 KIND_NAMES = tuple(VARIABLE_KINDS)
 _BASE = np.array([symbol("l" if name.startswith("point") else "x", 0) for name in KIND_NAMES], np.int64)
-_WORDS = {"se2": "a 2D pose", "se3": "a 3D pose", "point2": "a 2D point", "point3": "a 3D point"}
+KIND_WORDS = {"se2": "a 2D pose", "se3": "a 3D pose", "point2": "a 2D point", "point3": "a 3D point"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def _mentions(vertices: list[VertexColumns], edges: list[EdgeColumns]) -> _Menti
 
 
 def _clash(mentions: _Mentions, earlier: int, row: int) -> str:
-    before, now = (_WORDS[KIND_NAMES[mentions.kinds[k]]] for k in (earlier, row))
+    before, now = (KIND_WORDS[KIND_NAMES[mentions.kinds[k]]] for k in (earlier, row))
     return f"{mentions.ids[row]} as {now}, which is {before} on line {mentions.lines[earlier]}"
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from factorbus.formats.errors import FormatError
 from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.ranging import lone_ranges
+from factorbus.formats.robot_log import RobotLog
 from factorbus.formats.steps import Steps, planned, planned_whole
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch
@@ -26,6 +27,7 @@ class GraphFile:
     stay in `batch`, and are in no step.
     numbering: "ids" (keys are letters and ids), "apart" (the same, poses and points numbered separately) or "keys" (ids
     are keys): what `write_g2o` takes to write the same ids.
+    log: what a JRL file has beside the graph; of it factor_lines are the turns of the factors, by their stamps.
     """
 
     path: str
@@ -35,6 +37,7 @@ class GraphFile:
     notes: tuple[str, ...] = ()
     left_out: Mapping[str, int] = field(default_factory=dict)
     numbering: str = "ids"
+    log: RobotLog | None = None
 
     @property
     def poses(self) -> int:
@@ -52,23 +55,29 @@ class GraphFile:
 
     def whole(self, use_values: bool = True) -> Batch:
         """All steps as one insert, with the first pose fixed where the file leaves the choice.  Raises FormatError."""
-        return planned_whole(self.path, *self._joined(), use_values)
+        batch, lines, _ = self._joined()
+        return planned_whole(self.path, batch, lines, use_values)
 
     def account(self, whole: bool = False) -> dict[str, object]:
         """A program's account of how the file was read; whole: of all in `batch`, not of what a replay drives."""
         left_out = {name: count for name, count in self.left_out.items() if not (whole and name in _IN_NO_STEP)}
-        return {"dialect": self.dialect, "notes": list(self.notes), "left_out": left_out}
+        beside = {} if self.log is None else self.log.counts()
+        return {"dialect": self.dialect, "notes": list(self.notes), "left_out": left_out, **beside}
 
-    def _joined(self) -> tuple[Batch, tuple[I64, ...]]:
-        """The graph, and the lines of its factors, without what nothing is known of.  Raises FormatError."""
+    def _joined(self) -> tuple[Batch, tuple[I64, ...], tuple[I64, ...]]:
+        """The graph, and lines and times of its factors, without what nothing is known of.  Raises FormatError."""
         if self.dialect == "tum":
             raise FormatError(self.path, None, "a trajectory, which has no measurements", "a graph, with its factors")
         if not self.batch.factors:
             if not self.poses:
                 raise FormatError(self.path, None, "no pose", "at least one pose to replay")
-            return self.batch, self.factor_lines
+            return self.batch, self.factor_lines, ()
+        times = () if self.log is None else tuple(labels.stamps for labels in self.log.labels)
         lost = np.concatenate([unnamed(self.batch), lone_bearings(self.batch), lone_ranges(self.batch)])
-        return _without(self.batch, self.factor_lines, lost) if lost.size else (self.batch, self.factor_lines)
+        if not lost.size:
+            return self.batch, self.factor_lines, times
+        lines, times = (_left(self.batch, columns, lost) for columns in (self.factor_lines, times))
+        return _without(self.batch, lost), lines, times
 
 
 def unnamed(batch: Batch) -> I64:
@@ -78,20 +87,27 @@ def unnamed(batch: Batch) -> I64:
     return free[~np.isin(free, named)]
 
 
-def _without(batch: Batch, lines: tuple[I64, ...], keys: I64) -> tuple[Batch, tuple[I64, ...]]:
+def _without(batch: Batch, keys: I64) -> Batch:
     """The same without some variables and all factors on them."""
-    variables, factors, left = [], [], []
+    variables, factors = [], []
     for group in batch.variables:
         kept = ~np.isin(group.keys, keys)
         if kept.any():
             values = None if group.values is None else group.values[kept]
             stamps = None if group.stamps is None else group.stamps[kept]
             variables.append(group._replace(keys=group.keys[kept], values=values, stamps=stamps))
-    for group, at in zip(batch.factors, lines, strict=True):
+    for group in batch.factors:
         kept = ~np.isin(group.keys, keys).any(axis=1)
         if kept.any():
             scale = None if group.scale is None else group.scale[kept]
             rows = {"keys": group.keys[kept], "measured": group.measured[kept], "information": group.information[kept]}
             factors.append(group._replace(**rows, scale=scale))
-            left.append(at[kept])
-    return Batch(tuple(variables), tuple(factors)), tuple(left)
+    return Batch(tuple(variables), tuple(factors))
+
+
+def _left(batch: Batch, columns: tuple[I64, ...], keys: I64) -> tuple[I64, ...]:
+    """What is said of the factors that `_without` leaves: one array for each of its groups, if there are any."""
+    kept = [
+        column[~np.isin(group.keys, keys).any(axis=1)] for group, column in zip(batch.factors, columns, strict=False)
+    ]
+    return tuple(column for column in kept if column.size)

@@ -13,6 +13,7 @@ _SHOWN = 5
 _ONE = {
     "vertices": "vertex", "poses": "pose", "points": "point", "landmarks": "landmark", "variables": "variable",
     "factors": "factor", "time stamps": "time stamp", "fixed variables": "fixed variable",
+    "ground truth values": "ground truth value", "potential outliers": "potential outlier", "outliers": "outlier",
 }  # fmt: skip
 
 

@@ -16,15 +16,14 @@ class Bucket:
     numbers: list[int] = field(default_factory=list)
 
 
-def read_buckets(path: Path) -> dict[str, Bucket]:
-    """The lines of `path` by record, in the order of the file; blank lines and what follows a # are left out.
+def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
+    """The lines of `content` by record, in the order of the file; blank lines and what follows a # are left out.
 
-    Raises FormatError when the file cannot be read, is not text or has no record.
+    Raises FormatError when it is not text or has no record.
     """
-    content = _content(path)
     if b"\0" in content:
         line = content[: content.index(b"\0")].count(b"\n") + 1
-        raise FormatError(str(path), line, "a zero byte", "a text file in ASCII or UTF-8")
+        raise FormatError(file, line, "a zero byte", "a text file in ASCII or UTF-8")
     found: dict[bytes, Bucket] = {}
     for number, line in enumerate(content.split(b"\n"), 1):
         name, *rest = line.partition(b"#")[0].split(None, 1) or (b"",)
@@ -36,19 +35,18 @@ def read_buckets(path: Path) -> dict[str, Bucket]:
         bucket.rests.append(rest[0] if rest else b"")
         bucket.numbers.append(number)
     if not found:
-        raise FormatError(str(path), None, "no record at all", "lines such as EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1")
+        raise FormatError(file, None, "no record at all", "lines such as EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1")
     return {name.decode("utf-8", "backslashreplace"): bucket for name, bucket in found.items()}
 
 
-def _content(path: Path) -> bytes:
-    """The bytes of the file, unpacked where it is a gzip file, without a byte order mark."""
+def read_content(path: Path) -> bytes:
+    """The bytes of the file, unpacked where it is a gzip file, without a byte order mark.  Raises FormatError."""
     try:
         content = path.read_bytes()
         if content.startswith(b"\x1f\x8b"):
             content = gzip.decompress(content)
     except (OSError, EOFError, zlib.error) as failure:  # gzip reports a damaged file in these three ways
         reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else str(failure)
-        raise FormatError(
-            str(path), None, f"it cannot be read ({reason})", "a readable g2o, TORO, iSAM, SLAM++ or PyFactorGraph file"
-        ) from failure
+        wanted = "a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file"
+        raise FormatError(str(path), None, f"it cannot be read ({reason})", wanted) from failure
     return content.removeprefix(b"\xef\xbb\xbf")

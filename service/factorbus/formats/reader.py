@@ -11,14 +11,16 @@ from factorbus.formats.assemble import EdgeColumns, VertexColumns, assembled, nu
 from factorbus.formats.edges import Lead, Reading, read_edges, read_switches
 from factorbus.formats.errors import FormatError
 from factorbus.formats.graph import GraphFile, unnamed
+from factorbus.formats.jrl import JRL
 from factorbus.formats.left_out import LeftOut, shown
-from factorbus.formats.lines import Bucket, read_buckets
+from factorbus.formats.lines import Bucket, buckets_of, read_content
 from factorbus.formats.mixtures import best_components
 from factorbus.formats.numbers import read_numbers
 from factorbus.formats.offsets import Offsets, leave_cameras, read_offsets
 from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.pyfg import PYFG
 from factorbus.formats.ranging import lone_ranges
+from factorbus.formats.read_jrl import is_jrl, read_jrl
 from factorbus.formats.read_pyfg import is_pyfg, read_pyfg
 from factorbus.formats.read_tum import TUM, is_trajectory, read_trajectory
 from factorbus.formats.records import DIALECTS, G2O, SWITCH_PRIOR, Dialect, Vertex
@@ -30,7 +32,8 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol_parts
 from factorbus.wording import counted
 
-READS = (*DIALECTS, PYFG, TUM)
+READS = (*DIALECTS, PYFG, JRL, TUM)
+_NAMED = (PYFG, JRL)  # forms whose keys are symbols, and not ids
 
 # A prior of a point that names a pose is one of its position: RTAB-Map writes them so.
 _OF_POSES = {"prior_point2": "position_se2", "prior_point3": "position_se3"}
@@ -41,12 +44,13 @@ _CAMERAS = ("PARAMS_CAMERACALIB", "PARAMS_STEREOCAMERACALIB")
 def read(
     path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False, whole: bool = False
 ) -> GraphFile:
-    """The graph in `path`: g2o, TORO, iSAM, SLAM++, PyFactorGraph or TUM text, plain or gzipped.
+    """The graph in `path`: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL or TUM text, plain or gzipped.
 
-    dialect: "g2o", "toro", "isam", "slam++", "pyfg" or "tum"; without it the names of the records decide, and the
-    ending where they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no factors.
+    dialect: "g2o", "toro", "isam", "slam++", "pyfg", "jrl" or "tum"; without it the names of the records decide, and
+    the ending where they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no factors.
     Keys are symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols
-    and time stamps are, all keys are the ids themselves; of pyfg they are its names, A12 is symbol("A", 12).
+    and time stamps are, all keys are the ids themselves; of pyfg they are its names, A12 is symbol("A", 12).  JRL
+    is JSON: its keys are symbols, what it says beside the graph is `log`, and errors name the place in place of a line.
     Quaternions are normalized; angles stay as they are.  Records that have no kind here are left out, which `notes` and
     `left_out` say; with `strict` they are refused.  So are vertices that no step of a replay would have, unless the
     graph is wanted `whole`, as it is written to another file.  Raises FormatError, which names the file and the line.
@@ -57,7 +61,12 @@ def read(
 
 def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFile:
     file = str(path)
-    buckets = read_buckets(path)
+    content = read_content(path)
+    if dialect == JRL or (dialect is None and (is_jrl(content) or path.suffix.lower() == f".{JRL}")):
+        left = LeftOut(file, strict, whole)
+        batch, turns, log = read_jrl(file, content, left)
+        return replace(_graph(file, JRL, batch, turns, left, "keys"), log=log)
+    buckets = buckets_of(file, content)
     if dialect == PYFG or (dialect is None and is_pyfg(path, buckets)):
         left = LeftOut(file, strict, whole)
         return _graph(file, PYFG, *read_pyfg(file, buckets, left), left, "keys")
@@ -90,7 +99,7 @@ def _graph(file: str, dialect: str, batch: Batch, lines: tuple[I64, ...], left: 
     """The file, with what no step of its replay has set aside.  Raises FormatError when strict."""
 
     def names(keys: I64) -> list[str]:
-        return list(map(format_symbol, keys.tolist())) if dialect == PYFG else _ids_in_file(keys, numbering == "keys")
+        return list(map(format_symbol, keys.tolist())) if dialect in _NAMED else _ids_in_file(keys, numbering == "keys")
 
     lone = names(unnamed(batch)) if batch.factors else []
     left.set_aside("vertices", len(lone), f"no edge names {shown(lone)}")

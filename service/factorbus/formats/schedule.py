@@ -25,7 +25,7 @@ class Roster:
 
     keys, is_pose, fixed, valued (N,); rank (N,): the place of a pose in the order of the poses, -1 for points;
     pose_at (P,): the pose of each rank; before (N,): the pose before a pose, -1 for none (`_ordered`); ends: per group
-    of factors the rows (m, arity) of its variables.
+    of factors the rows (m, arity) of its variables; since: the rank (m,) of the first pose that finds each there.
     """
 
     keys: I64
@@ -36,6 +36,7 @@ class Roster:
     pose_at: I64
     before: I64
     ends: tuple[I64, ...]
+    since: tuple[I64, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +49,11 @@ class Schedule:
     given: I64
 
 
-def roster(file: str, batch: Batch) -> Roster:
-    """The variables of `batch`.  Raises FormatError when a factor names a variable that it does not have."""
+def roster(file: str, batch: Batch, times: Sequence[I64] = ()) -> Roster:
+    """The variables of `batch`.  Raises FormatError when a factor names a variable that it does not have.
+
+    times: of the factors of each group, where they have some of their own.
+    """
     empty = np.empty(0, np.int64)
     keys = np.concatenate([empty, *(group.keys for group in batch.variables)])
     is_pose = _spread(batch, [group.kind in POSES for group in batch.variables])
@@ -72,6 +76,7 @@ def roster(file: str, batch: Batch) -> Roster:
         pose_at=pose_at,
         before=before,
         ends=tuple(ends),
+        since=_since(batch, ends, times, pose_at),
     )
 
 
@@ -93,6 +98,23 @@ def _ordered(batch: Batch, keys: I64, is_pose: np.ndarray) -> tuple[I64, I64]:
     for chain in chains:
         before[chain[1:]] = chain[:-1]
     return poses, before
+
+
+def _since(batch: Batch, ends: Sequence[I64], times: Sequence[I64], pose_at: I64) -> tuple[I64, ...]:
+    """The rank of the first pose that finds each factor there: 0 but of late factors between two poses.
+
+    Those are of a time after that of both poses, as loop closures are of robots that could not talk before.  They come
+    with the first pose of their time or later, or with the last one.
+    """
+    stamps = np.concatenate([np.empty(0, np.int64), *(_stamps(group) for group in batch.variables)])
+    since = [np.zeros(len(rows), np.int64) for rows in ends]
+    if (stamps[pose_at] == NO_STAMP).any():  # then the order is not that of time
+        return tuple(since)
+    for group, rows, at, first in zip(batch.factors, ends, times, since, strict=False):
+        if all(end in POSES for end in FACTOR_KINDS[group.kind].connects):
+            late = at > stamps[rows].max(axis=1)
+            first[late] = np.minimum(np.searchsorted(stamps[pose_at], at[late]), len(pose_at) - 1)
+    return tuple(since)
 
 
 def _stamps(group: Variables) -> I64:
@@ -158,22 +180,23 @@ def _refuse_unknown_fixed(file: str, names: Roster) -> None:
 
 
 def _pairs(batch: Batch, names: Roster, points: bool) -> I64:
-    """Rows (m, 2) of the variables of all factors between two poses, or between a pose and a point, but for ranges."""
+    """(m, 3) of all factors between two poses, or a pose and a point, but for ranges: both rows, and since when."""
     chosen = [
-        ends
-        for group, ends in zip(batch.factors, names.ends, strict=True)
+        np.column_stack([ends, since])
+        for group, ends, since in zip(batch.factors, names.ends, names.since, strict=True)
         if group.kind not in RANGES
         and ends.shape[1] == 2
         and (FACTOR_KINDS[group.kind].connects[1] not in POSES) == points
     ]
-    return np.concatenate([np.empty((0, 2), np.int64), *chosen])
+    return np.concatenate([np.empty((0, 3), np.int64), *chosen])
 
 
 def _in_turn(batch: Batch, names: Roster, seeds: np.ndarray) -> tuple[I64 | None, I64]:
     """Entries when every pose can enter at its own turn: each is a seed or has an edge to an earlier one."""
-    ranks = names.rank[_pairs(batch, names, points=False)]
+    pairs = _pairs(batch, names, points=False)
+    later = names.rank[pairs[:, :2]].max(axis=1, initial=-1)
     joined = seeds[names.pose_at].copy()
-    joined[ranks.max(axis=1, initial=-1)] = True
+    joined[later[pairs[:, 2] <= later]] = True
     if not seeds[names.pose_at[0]] or not joined.all():
         return None, np.empty(0, np.int64)
     return names.rank.copy(), np.empty(0, np.int64)
@@ -182,16 +205,21 @@ def _in_turn(batch: Batch, names: Roster, seeds: np.ndarray) -> tuple[I64 | None
 def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> tuple[I64, I64]:
     """Entries of poses when some must wait, pose by pose, and of the points that only ranges see.
 
-    A pose is reached over an edge from a pose that is in.  When there is none, a pose that sees a point that is in,
-    or a fixed one, is let in at the value its vertex line gives, if it has one; and so is a body that ranges determine.
+    A pose is reached over an edge from a pose that is in, once the edge is there.  When there is none, a pose that sees
+    a point that is in, or a fixed one, is let in at the value its vertex line gives, if it has one; and so is a body
+    that ranges determine.
     """
     edges, sightings = _neighbours(_pairs(batch, names, False)), _neighbours(_pairs(batch, names, True))
+    late = _late(_pairs(batch, names, False))
     entry = np.full(len(names.keys), -1, np.int64)
     known = set(np.flatnonzero(names.fixed & ~names.is_pose).tolist())
     given: list[int] = []
 
     def is_in(row: int) -> bool:
         return entry[row] >= 0 or row in known
+
+    def is_next(row: int, turn: int) -> bool:
+        return entry[row] < 0 and names.rank[row] <= turn
 
     def enter(turn: int, first: int) -> list[int]:
         """Let `first` in and all poses that had been waiting for it; what may be let in now."""
@@ -202,35 +230,37 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> 
                 continue
             entry[pose] = turn
             sighted += ranges.of(pose)
-            waiting += [other for other in edges[pose] if entry[other] < 0 and names.rank[other] <= turn]
-            for point in sightings[pose]:
+            waiting += [other for other, since in edges[pose] if is_next(other, turn) and since <= turn]
+            for point, _ in sightings[pose]:
                 if point not in known:
                     known.add(point)
-                    sighted += [*sightings[point], *ranges.of(point)]
+                    sighted += [*(seen for seen, _ in sightings[point]), *ranges.of(point)]
         return sighted
 
     def body_of(row: int, turn: int) -> list[int]:
         """A point alone, or the poses so far that odometry joins to a pose."""
         found, waiting = {row}, [row]
         while waiting and names.is_pose[row]:
-            new = {other for other in edges[waiting.pop()] if names.rank[other] <= turn and entry[other] < 0} - found
+            new = {other for other, since in edges[waiting.pop()] if is_next(other, turn) and since <= turn} - found
             found |= new
             waiting += new
         return sorted(found)
 
     for turn, pose in enumerate(names.pose_at.tolist()):
         candidates = [pose]
-        if seeds[pose] or any(entry[other] >= 0 for other in edges[pose]):
+        if seeds[pose] or any(entry[other] >= 0 and since <= turn for other, since in edges[pose]):
             candidates = enter(turn, pose)
+        for one, other in late[turn]:
+            if (entry[one] < 0) != (entry[other] < 0):
+                candidates += enter(turn, one if entry[one] < 0 else other)
         while candidates:
-            late = candidates.pop()
-            ready = names.rank[late] <= turn and entry[late] < 0 and names.valued[late]
-            if not ready or not (names.is_pose[late] or ranges.lone[late]):
+            row = candidates.pop()
+            if not (is_next(row, turn) and names.valued[row] and (names.is_pose[row] or ranges.lone[row])):
                 continue
-            sees = names.is_pose[late] and any(point in known for point in sightings[late])
-            if sees or (ranges and ranges.determine(body_of(late, turn), is_in)):
-                given.append(late)
-                candidates += enter(turn, late)
+            sees = names.is_pose[row] and any(point in known for point, _ in sightings[row])
+            if sees or (ranges and ranges.determine(body_of(row, turn), is_in)):
+                given.append(row)
+                candidates += enter(turn, row)
     _enter_undetermined(names, ranges, entry, given)
     return entry, np.array(given, np.int64)
 
@@ -263,11 +293,20 @@ def _known_poses(batch: Batch, names: Roster, root: int, given: I64, use_values:
     return known
 
 
-def _neighbours(pairs: I64) -> dict[int, list[int]]:
-    found: dict[int, list[int]] = defaultdict(list)
-    for one, other in pairs.tolist():
-        found[one].append(other)
-        found[other].append(one)
+def _neighbours(pairs: I64) -> dict[int, list[tuple[int, int]]]:
+    """By variable (the other, since when)."""
+    found: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for one, other, since in pairs.tolist():
+        found[one].append((other, since))
+        found[other].append((one, since))
+    return found
+
+
+def _late(pairs: I64) -> dict[int, list[tuple[int, int]]]:
+    """By turn the pairs of poses that are joined from then on."""
+    found: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for one, other, since in pairs[pairs[:, 2] > 0].tolist():
+        found[since].append((one, other))
     return found
 
 

@@ -40,10 +40,11 @@ class Steps(Sequence[Batch]):
 
     Poses come in the order of their keys, or of time where all have a stamp.  A step is a new pose with its edges to
     poses that are in (the one from the pose before it first, the rest in the order of the file), the points it is the
-    first to see, and its sightings.  A pose that nothing joins to earlier ones waits for the pose that does.  New
-    variables have no value, so that the service composes them from what was measured, except fixed ones, poses that
-    only points or ranges join to the rest, points that only ranges see, and with `use_values` all that have one.
-    Where nothing is fixed and no pose has a prior the first pose is fixed, at its value or the origin.
+    first to see, and its sightings.  A pose that nothing joins to earlier ones waits for the pose that does, and a
+    factor between two poses that is of a later time than both for a pose of its time.  New variables have no value, so
+    that the service composes them from what was measured, except fixed ones, poses that only points or ranges join to
+    the rest, points that only ranges see, and with `use_values` all that have one.  Where nothing is fixed and no pose
+    has a prior the first pose is fixed, at its value or the origin.
     """
 
     def __init__(self, count: int, variables: list[_VariableColumns], factors: list[_FactorColumns]) -> None:
@@ -90,9 +91,9 @@ class Steps(Sequence[Batch]):
         return Batch(tuple(variables), tuple(factors))
 
 
-def planned(file: str, batch: Batch, lines: Sequence[I64], use_values: bool) -> Steps:
-    """The steps of `batch`, whose factors stand on `lines`.  Raises FormatError."""
-    names = roster(file, batch)
+def planned(file: str, batch: Batch, lines: Sequence[I64], times: Sequence[I64], use_values: bool) -> Steps:
+    """The steps of `batch`, whose factors stand on `lines` and may have times of their own.  Raises FormatError."""
+    names = roster(file, batch, times)
     return _cut(batch, lines, names, scheduled(file, batch, names, use_values), use_values)
 
 
@@ -108,10 +109,15 @@ def _cut(batch: Batch, lines: Sequence[I64], names: Roster, plan: Schedule, use_
     turns, step = np.unique(plan.entry, return_inverse=True)
     variables = _variable_columns(batch, names, plan, step, len(turns), use_values)
     factors = [
-        _factor_columns(group, ends, at, names, step, len(turns))
-        for group, ends, at in zip(batch.factors, names.ends, lines, strict=True)
+        _factor_columns(group, rows, at, names, np.maximum(step[rows].max(axis=1), _first(turns, since)), len(turns))
+        for group, rows, since, at in zip(batch.factors, names.ends, names.since, lines, strict=True)
     ]
     return Steps(len(turns), variables, factors)
+
+
+def _first(turns: I64, since: I64) -> I64:
+    """The first step of a turn from `since` on, or the last one."""
+    return np.minimum(np.searchsorted(turns, since), len(turns) - 1)
 
 
 def _variable_columns(
@@ -164,8 +170,8 @@ def _origins(kind: str, count: int) -> F64:
     return origins
 
 
-def _factor_columns(group: Factors, ends: I64, lines: I64, names: Roster, step: I64, count: int) -> _FactorColumns:
-    at = step[ends].max(axis=1)
+def _factor_columns(group: Factors, ends: I64, lines: I64, names: Roster, at: I64, count: int) -> _FactorColumns:
+    """By step, `at` (m,)."""
     order = np.lexsort((lines, ~_odometry(group, ends, lines, names), at))
     scale = None if group.scale is None else group.scale[order]
     return _FactorColumns(

@@ -107,7 +107,7 @@ def gate_command(
 ) -> int:
     """Whether the factors in the file CANDIDATES are plausible; the exit code is 1 when one is not.
 
-    The file is g2o, TORO, iSAM, SLAM++ or PyFactorGraph text. Its keys are those of the map; its vertices are not
+    The file is g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL text. Its keys are those of the map; its vertices are not
     looked at.
     A file without a factor that can be read is refused (3); with --strict, so is one of which anything is left out.
 

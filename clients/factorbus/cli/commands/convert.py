@@ -7,14 +7,22 @@ import click
 
 from factorbus.cli.output.exits import output_file
 from factorbus.cli.process.options import file_argument, json_option
-from factorbus.cli.process.reading import COUNTED, IDS, read_graph, reading_options, robot_option, say
+from factorbus.cli.process.reading import (
+    COUNTED,
+    GRAPHS,
+    IDS,
+    check_chosen,
+    read_graph,
+    reading_options,
+    robot_option,
+    say,
+)
 from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from factorbus.formats import GraphFile
 
-_GRAPHS = (".g2o", ".pyfg")
-_WRITES = (*_GRAPHS, ".tum", ".kitti")
+_WRITES = (*GRAPHS, ".tum", ".kitti")
 
 
 @click.command()
@@ -28,20 +36,30 @@ _WRITES = (*_GRAPHS, ".tum", ".kitti")
     help="Of a .g2o: auto, as in SOURCE; ids, without letters; keys, as GTSAM packs symbols; counted, 0 1 2 ...  "
     "[default: auto]",
 )
+@click.option("--ground-truth", is_flag=True, help="Write the ground truth of a .jrl in place of its values.")
 @json_option
 def command(
-    source: Path, target: Path, dialect: str | None, strict: bool, robot: str | None, ids: str | None, as_json: bool
+    source: Path,
+    target: Path,
+    dialect: str | None,
+    strict: bool,
+    robot: str | None,
+    ids: str | None,
+    ground_truth: bool,
+    as_json: bool,
 ) -> None:
-    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg or TUM text) and write TARGET (.g2o, .pyfg, .tum
-    or .kitti, by its ending).
+    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg, JRL .jrl or TUM text) and write TARGET (.g2o,
+    .pyfg, .jrl, .tum or .kitti, by its ending).
 
     What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
     letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum. A .tum has each pose's time stamp.
+    With --ground-truth it is where the poses really were, which a .jrl may say.
 
     \b
     factorbus convert w10000.graph w10000.g2o
     factorbus convert estimate.g2o estimate.tum
     factorbus convert goats.pyfg goats.g2o
+    factorbus convert ntu.jrl truth.tum --ground-truth
     factorbus convert two-robots.g2o a.tum --robot a
     factorbus convert edges.txt edges.g2o --dialect slam++
     """
@@ -49,15 +67,13 @@ def command(
         raise click.BadParameter(
             f"{target} does not end in {' or '.join((', '.join(_WRITES[:-1]), _WRITES[-1]))}", param_hint="TARGET"
         )
-    if ids is not None and target.suffix == ".pyfg":
-        raise click.UsageError("--ids is of a .g2o: a .pyfg has the names of the keys")
-    if ids is not None and target.suffix != ".g2o":
-        raise click.UsageError("--ids is of a .g2o: a trajectory has times instead")
-    if robot is not None and target.suffix in _GRAPHS:
-        raise click.UsageError(f"--robot is of trajectories: a {target.suffix} has the whole graph")
+    check_chosen(target, robot, ids)
+    if ground_truth and target.suffix in GRAPHS:
+        raise click.UsageError(f"--ground-truth is of trajectories: a {target.suffix} has the whole graph")
     from factorbus.cli.output.console import document, print_note
 
     graph = read_graph(source, dialect, strict, whole=True)
+    graph = _of_truth(graph) if ground_truth else graph
     _check_any(graph, target)
     with output_file(target):
         files, notes, counts = _written(graph, target, strict, robot, ids or "auto")
@@ -69,15 +85,27 @@ def command(
     print_note(f"{', '.join(map(str, files))}: {told}")
 
 
+def _of_truth(graph: "GraphFile") -> "GraphFile":
+    """The poses alone, where they really were.  Raises FormatError."""
+    from dataclasses import replace
+
+    from factorbus.formats import FormatError
+    from factorbus.proto.messages import Batch
+
+    if graph.log is None or not graph.log.known:
+        raise FormatError(graph.path, None, "no ground truth", "a .jrl with its groundtruth")
+    return replace(graph, batch=Batch(graph.log.ground_truth), log=None)
+
+
 def _check_any(graph: "GraphFile", target: Path) -> None:
     """Raises FormatError where nothing of `graph` would be in `target`."""
     from factorbus.formats import FormatError
 
-    if target.suffix in _GRAPHS and not (graph.batch.variable_count or graph.batch.factor_count):
+    if target.suffix in GRAPHS and not (graph.batch.variable_count or graph.batch.factor_count):
         raise FormatError(
             graph.path, None, f"nothing that a {target.suffix} would have", "at least one vertex or edge that is read"
         )
-    if target.suffix not in _GRAPHS and not graph.poses:
+    if target.suffix not in GRAPHS and not graph.poses:
         raise FormatError(graph.path, None, f"no pose, and a {target.suffix} has nothing else", "at least one pose")
 
 
@@ -85,22 +113,23 @@ def _written(
     graph: "GraphFile", target: Path, strict: bool, robot: str | None, ids: str
 ) -> tuple[list[Path], tuple[str, ...], dict[str, int]]:
     """(the files, what was left out of them, how much is in them).  Raises FormatError, SeveralRobots."""
-    from factorbus.formats import tum_notes, write_g2o, write_kitti, write_pyfg, write_tum
+    from factorbus.formats import tum_notes, write_graph, write_kitti, write_tum
     from factorbus.formats.left_out import LeftOut
     from factorbus.formats.trajectory import one_trajectory, trajectories, untimed
 
     counts = {"poses": graph.poses, "landmarks": graph.landmarks, "factors": graph.batch.factor_count}
-    if target.suffix == ".g2o":
+    if target.suffix in GRAPHS:
         same = graph.numbering if graph.numbering != "ids" else "auto"
-        return [target], write_g2o(target, graph.batch, strict, same if ids == "auto" else ids), counts
-    if target.suffix == ".pyfg":
-        return [target], write_pyfg(target, graph.batch, strict), counts
+        notes = write_graph(target, graph.batch, strict, same if ids == "auto" else ids, graph.log)
+        return [target], notes, counts
     form = target.suffix[1:].upper()
     found = trajectories(graph.batch, form)
     chosen = [one_trajectory(graph.batch, form, robot)] if robot is not None else list(found.values())
     left = LeftOut(str(target))
     for name in ("landmarks", "factors"):
         left.drop(name, counts[name], "a trajectory has poses alone")
+    if graph.log is not None and graph.log.known:
+        left.drop("ground truth values", graph.log.known, "--ground-truth writes them in place of the others")
     left.drop("poses", graph.poses - sum(map(len, chosen)), f"of other robots than {robot!r}")
     write, notes = (write_tum, tum_notes) if form == "TUM" else (write_kitti, lambda *_: ())
     untold = sum(len(untimed(rows)) for rows in chosen) if form == "TUM" else 0

@@ -20,8 +20,8 @@ _FROM_BUS = "SOURCE is a map of the service at ENDPOINT."
 def command() -> None:
     """Draw into a .png, .svg or .pdf file, in colours that colour-blind readers can tell apart.
 
-    SOURCE is a graph file (g2o, TORO, iSAM, SLAM++, pyfg), the name of a data set, or with --connect the name of a map
-    on the bus. What of a file is left out is said.
+    SOURCE is a graph file (g2o, TORO, iSAM, SLAM++, pyfg, JRL), the name of a data set, or with --connect the name of a
+    map on the bus. What of a file is left out is said.
 
     \b
     factorbus plot map town.g2o --solve
@@ -57,13 +57,15 @@ def map_command(
     ellipses: int,
     out: Path | None,
 ) -> None:
-    """Trajectory, landmarks, loop closures, and where odometry alone would have led.
+    """Trajectory, landmarks, loop closures, where odometry alone would have led, and the ground truth of a .jrl, moved
+    as one rigid body to where it fits the trajectory best.
 
     \b
     factorbus plot map intel --solve --out intel.pdf
     factorbus plot map victoria_park --solve --ellipses 60
     factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --ellipses 60
     """
+    from factorbus.cli.driving.aligned_truth import aligned_truth
     from factorbus.cli.driving.picture import draw
     from factorbus.cli.driving.plot_source import graph_of, solved, spread_in, with_values
     from factorbus.viz import DriveHistory
@@ -72,8 +74,10 @@ def map_command(
     drawn = solved(drawn, on_file=connect is None) if solve else with_values(drawn)
     path = drawn.file("map", out)
     spread = spread_in(drawn, connect, ellipses, zenoh) if ellipses else None
+    estimate = drawn.graph.variables
+    truth = aligned_truth(drawn.truth, estimate)
     with output_file(path):
-        draw(path, [drawn.unsolved()], drawn.graph.variables, DriveHistory(), drawn.name, drawn.about, spread=spread)
+        draw(path, [drawn.unsolved()], estimate, DriveHistory(), drawn.name, drawn.about, truth, spread)
     click.echo(path)
 
 

@@ -102,12 +102,12 @@ class ReplayRequest:
 @click.option("--pace", type=Number(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
 @out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
-@out_option("--out", "out", "Write the estimate and the factors as g2o or pyfg, by the ending.", "FILE.g2o|.pyfg")
+@out_option("--out", "out", "Write the estimate and the factors, in the form of the ending.", "FILE.g2o|.pyfg|.jrl")
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @reading_options
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
-    """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, or the name of a data set) through a map, pose by pose.
+    """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, or a data set's name) through a map, pose by pose.
 
     Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
     there after every step. What FILE fixes holds the map in place, or its priors; without either the pose of the lowest
@@ -129,6 +129,8 @@ def command(as_json: bool, **asked: Any) -> None:
       against_batch  χ² over that of the optimum found from scratch, and what led to it (start): the map's own values
                    (with --use-values the file's), composed odometry or averaged rotations, whichever ends lowest;
                    batch_converged false: its search ended before it had converged, the true optimum may be lower
+      error_m      of a .jrl with ground truth: how far the poses are from it, which is first moved as one rigid body
+                   to where it fits the estimate best (rms, max, and of how many poses)
       adopted      null, or what the map left for a better optimum at the end (better_optimum)
     """
     request = ReplayRequest(**asked)
@@ -149,6 +151,7 @@ def command(as_json: bool, **asked: Any) -> None:
 
 def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
     """Do it, with progress on standard error; returns the document, and hands it to `report` while the map is there."""
+    from factorbus.cli.driving.aligned_truth import aligned_error_m
     from factorbus.cli.driving.drive import insert_steps
     from factorbus.cli.driving.replay_source import source_of
     from factorbus.cli.output import console as screen
@@ -169,12 +172,14 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
         adopted = None
         if request.settle and request.adopt:
             last, adopted = _adopt(request, target, last)
-        written = _write(request, target, graph.numbering)
+        written = _write(request, target, graph)
+        truth = graph.log.ground_truth if graph.log else ()
         if request.plot:
             with output_file(request.plot):
-                _draw(request.plot, request.file.name, driven, target, steps)
+                _draw(request.plot, request.file.name, driven, target, steps, truth)
         result = _document(request, driven, target, steps, last, unsettled, before)
         result |= {"read": graph.account(), "written": [str(file) for file in written], "adopted": adopted}
+        result |= {"error_m": aligned_error_m(truth, target.estimate())} if truth else {}
         report(result)
         if request.live:
             _stay()
@@ -290,22 +295,18 @@ def _stay() -> None:
         wait_until(stop)
 
 
-def _write(request: ReplayRequest, target: Any, numbering: str) -> list[Path]:
+def _write(request: ReplayRequest, target: Any, source: Any) -> list[Path]:
     """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
     from factorbus.cli.output.console import print_note
     from factorbus.cli.process.reading import say
-    from factorbus.formats import write_g2o, write_kitti, write_pyfg, write_tum
+    from factorbus.formats import write_graph, write_kitti, write_tum
     from factorbus.proto.messages import Batch
 
     files: list[Path] = []
     if request.out:
-        ids = numbering if numbering != "ids" else "auto"
-        graph, strict = target.graph(), request.strict
+        ids = source.numbering if source.numbering != "ids" else "auto"
         with output_file(request.out):
-            if request.out.suffix == ".g2o":
-                notes = write_g2o(request.out, graph, strict, ids)
-            else:
-                notes = write_pyfg(request.out, graph, strict)
+            notes = write_graph(request.out, target.graph(), request.strict, ids, _truth_of(source, request.out))
         say(request.out, notes)
         files.append(request.out)
     for path, write in ((request.tum, write_tum), (request.kitti, write_kitti)):
@@ -318,11 +319,19 @@ def _write(request: ReplayRequest, target: Any, numbering: str) -> list[Path]:
     return files
 
 
-def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:
+def _truth_of(source: Any, out: Path) -> Any:
+    """Of the log that was read what a file of the map can have: a map has no labels of factors."""
+    return replace(source.log, labels=()) if source.log and out.suffix == ".jrl" else None
+
+
+def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any, truth: Any) -> None:
+    from factorbus.cli.driving.aligned_truth import aligned_truth
     from factorbus.cli.driving.picture import draw, history_of
 
     reports = [step.report for step in driven.steps]
-    draw(path, steps, target.estimate(), history_of(reports, target.compared()), title)
+    estimate = target.estimate()
+    history = history_of(reports, target.compared())
+    draw(path, steps, estimate, history, title, truth=aligned_truth(truth, estimate))
 
 
 def _fixed(steps: Any) -> list[str]:
@@ -365,6 +374,9 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("estimates received", f"{result['deltas']}, at revision {result['revision']}"))
     initial = "" if result["chi2_initial"] is None else f", {result['chi2_initial']:.6g} by odometry"
     rows.append(("χ²", f"{result['chi2']:.8g}, {result['chi2_unsettled']:.8g} after the last step{initial}"))
+    if error := result.get("error_m"):
+        away = f"rms {error['rms']:.3g} m, max {error['max']:.3g} m of {counted(error['poses'], 'pose')}"
+        rows.append(("from ground truth", f"{away}, aligned"))
     for each in result["against_batch"]:
         by = f"{_optimum(each, result)}; {each['worker']}, {each['seconds']:.2f} s"
         worse = "  better_optimum" if each["better_optimum"] else ""

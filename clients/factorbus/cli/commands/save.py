@@ -7,12 +7,12 @@ import click
 
 from factorbus.cli.output.exits import REFUSED, Stopped, output_file
 from factorbus.cli.process.options import checked_output, connect_option, timeout_option, zenoh_option
-from factorbus.cli.process.reading import IDS
+from factorbus.cli.process.reading import GRAPHS, IDS, check_chosen
 
 if TYPE_CHECKING:
     from factorbus.client import Map
 
-_WRITES = (".g2o", ".tum", ".kitti")
+_WRITES = (*GRAPHS, ".tum", ".kitti")
 
 
 @click.command()
@@ -31,7 +31,8 @@ _WRITES = (".g2o", ".tum", ".kitti")
 def command(
     name: str, target: Path, robot: str | None, ids: str | None, endpoint: str, zenoh: str, timeout_s: float
 ) -> None:
-    """Write MAP as it is now into FILE: the whole graph as .g2o, or trajectories as .tum or .kitti, by its ending.
+    """Write MAP as it is now into FILE: the whole graph as .g2o, .pyfg or .jrl, or trajectories as .tum or
+    .kitti, by its ending.
 
     A trajectory is of one robot, the letter of its poses' keys. Of several each gets a file of its own: out.tum becomes
     out-a.tum and out-b.tum. Its times are the poses' time stamps, and where no pose has one the numbers of their keys;
@@ -40,19 +41,17 @@ def command(
     \b
     factorbus save warehouse warehouse.g2o
     factorbus save warehouse counted.g2o --ids counted
+    factorbus save warehouse warehouse.pyfg
     factorbus save warehouse way.tum --robot a
     """
     if target.suffix not in _WRITES:
         raise click.BadParameter(f"{target} does not end in {', '.join(_WRITES)}", param_hint="FILE")
-    if robot is not None and target.suffix == ".g2o":
-        raise click.UsageError("--robot is of trajectories: a .g2o has the whole graph")
-    if ids is not None and target.suffix != ".g2o":
-        raise click.UsageError("--ids is of a .g2o: a trajectory has times instead")
+    check_chosen(target, robot, ids)
     from factorbus.cli.process.bus import open_bus
 
     form = target.suffix.removeprefix(".")
     with open_bus(endpoint, "save", zenoh, timeout_s) as bus, bus.map(name, mirror=False, create=False) as joined:
-        robots = [] if form == "g2o" else _robots(joined, robot)
+        robots = [] if target.suffix in GRAPHS else _robots(joined, robot)
         texts = (
             {letter: joined.export(form, robot=letter) for letter in robots}
             if robots

@@ -15,7 +15,7 @@ from factorbus.wording import counted
 @click.argument("world", type=click.Choice(WORLDS))
 @click.option("--poses", type=click.IntRange(2, 1_000_000), default=3500, show_default=True, metavar="N")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
-@out_option("--out", "out", "What the robot measured, as g2o.", "FILE.g2o")
+@out_option("--out", "out", "What the robot measured; a .jrl has the truth as well.", "FILE.g2o|.pyfg|.jrl")
 @out_option("--truth", "truth", "Where it really was, in TUM form.", "FILE.tum")
 def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | None) -> None:
     """Drive a robot through WORLD and write what it measured.
@@ -37,7 +37,7 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
     from factorbus.cli.driving.columns import merged
     from factorbus.cli.output import console as screen
     from factorbus.cli.process.reading import say
-    from factorbus.formats import write_g2o, write_tum
+    from factorbus.formats import RobotLog, write_graph, write_tum
     from factorbus.proto.messages import Batch
 
     batches, truths = [], []
@@ -50,7 +50,8 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
     if out:
         graph = merged(batches)
         with output_file(out):
-            notes = write_g2o(out, graph, ids="counted")  # what every program reads
+            log = RobotLog(world, (), merged(truths).variables) if out.suffix == ".jrl" else None
+            notes = write_graph(out, graph, ids="counted", log=log)  # ids of a .g2o that every program reads
         say(out, notes)
         screen.print_note(f"{out}: {counted(poses, 'pose')}, {counted(graph.factor_count, 'factor')}")
     if truth:

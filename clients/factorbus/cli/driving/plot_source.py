@@ -1,6 +1,6 @@
 """What `factorbus plot` draws: a graph file, a data set by its name, or a map on the bus."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,11 +16,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A graph with values, and what to call it."""
+    """A graph with values, what to call it, and where its variables really were, if that is known."""
 
     name: str
     graph: Batch
     about: str
+    truth: tuple[Variables, ...] = ()
 
     def unsolved(self) -> Batch:
         """The same without the values of what is estimated: what odometry alone starts from."""
@@ -39,7 +40,8 @@ def graph_of(
     if connect is not None:
         return _from_bus(source, connect, zenoh)
     file = file_named(source, dialect, strict)
-    return Drawn(Path(file.path).stem, file.whole(), f"values as in {Path(file.path).name}")
+    truth = file.log.ground_truth if file.log else ()
+    return Drawn(Path(file.path).stem, file.whole(), f"values as in {Path(file.path).name}", truth)
 
 
 def file_named(source: str, dialect: str | None = None, strict: bool = False) -> "GraphFile":
@@ -72,7 +74,7 @@ def with_values(drawn: Drawn) -> Drawn:
         + (f", {left} are not drawn (--solve places them)" if left else "")
     )
     about = "values composed from odometry" if composed == sum(g.keys.size for g in have) else drawn.about
-    return Drawn(drawn.name, Batch(tuple(have), drawn.graph.factors), about)
+    return replace(drawn, graph=Batch(tuple(have), drawn.graph.factors), about=about)
 
 
 def solved(drawn: Drawn, on_file: bool = True) -> Drawn:
@@ -92,7 +94,7 @@ def solved(drawn: Drawn, on_file: bool = True) -> Drawn:
     )
     found = optimum_from(result.start, on_file, result.converged)
     about = f"χ² {result.chi2:.6g}, {found}, after {counted(result.iterations, 'iteration')}"
-    return Drawn(drawn.name, Batch(groups, drawn.graph.factors), about)
+    return replace(drawn, graph=Batch(groups, drawn.graph.factors), about=about)
 
 
 def spread_in(drawn: Drawn, connect: str | None, most: int, zenoh: str = "") -> "Spread":

@@ -19,8 +19,8 @@ def source_of(given: Path, places: Places | None = None, catalogue: Sequence[Dat
     if str(given) not in known:
         raise Stopped(
             "bad_file",
-            f"{given}: no such file, and no data set of that name; wanted a g2o, TORO, iSAM, SLAM++ or "
-            f"PyFactorGraph file, or one of {', '.join(dataset.name for dataset in catalogue)}",
+            f"{given}: no such file, and no data set of that name; wanted a g2o, TORO, iSAM, SLAM++, "
+            f"PyFactorGraph or JRL file, or one of {', '.join(dataset.name for dataset in catalogue)}",
             BAD_FILE,
             path=str(given),
         )

@@ -12,9 +12,10 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 # The graph formats that are read; `tests/clients/test_cli_files.py` holds them to the reader's own list.
-DIALECTS = ("g2o", "toro", "isam", "slam++", "pyfg", "tum")
+DIALECTS = ("g2o", "toro", "isam", "slam++", "pyfg", "jrl", "tum")
 COUNTED = (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))  # of a graph, and of one of them
 IDS = ("auto", "ids", "keys", "counted")
+GRAPHS = (".g2o", ".pyfg", ".jrl")  # endings of files that are written with the whole graph; others are trajectories
 
 
 def reading_options(command: F) -> F:
@@ -38,6 +39,15 @@ def robot_option(command: F) -> F:
         metavar="LETTER",
         help='Write the trajectory of this robot alone ("" for keys without a letter).  [default: a file for each]',
     )(command)
+
+
+def check_chosen(target: Path, robot: str | None, ids: str | None) -> None:
+    """Raises UsageError where --robot or --ids is not of such a file."""
+    if robot is not None and target.suffix in GRAPHS:
+        raise click.UsageError(f"--robot is of trajectories: a {target.suffix} has the whole graph")
+    if ids is not None and target.suffix != ".g2o":
+        instead = f"a {target.suffix} has the keys themselves" if target.suffix in GRAPHS else "a trajectory has times"
+        raise click.UsageError(f"--ids is of a .g2o: {instead}")
 
 
 def read_graph(path: Path, dialect: str | None = None, strict: bool = False, whole: bool = False) -> "GraphFile":

@@ -25,7 +25,7 @@ from factorbus.service.questions.uncertainty import DECODE, MissingVariables, Un
 from factorbus.solver.changes.repair import repair
 from factorbus.solver.errors import SolverError
 
-_FORMATS = ("g2o", "tum", "kitti")
+_GRAPHS, _TRAJECTORIES = ("g2o", "pyfg", "jrl"), ("tum", "kitti")
 _IDS = ("auto", "ids", "keys", "counted")
 _WAIT_S = (0.001, 86_400.0)
 # How many times the bytes of the solver it takes to repair a map, and to factorize one in a mode that keeps no R.
@@ -107,15 +107,17 @@ def parse(name: str, payload: bytes) -> Question:
 
 def _export(content: dict[str, Any]) -> Question:
     """The question for a file.  Raises BadMessage, BadOption."""
-    format = fields.choice_of("question", content, "format", _FORMATS, "g2o")
+    format = fields.choice_of("question", content, "format", (*_GRAPHS, *_TRAJECTORIES), "g2o")
     ids = fields.choice_of("question", content, "ids", _IDS, "auto")
     robot = fields.text("question", content, "robot", "") if content.get("robot") is not None else None
     if robot is not None and (len(robot) > 1 or (robot and not (robot.isascii() and robot.isalpha()))):
         raise BadOption("question.robot", f"is {robot[:40]!r}", "one ASCII letter, or an empty string")
-    if robot is not None and format == "g2o":
-        raise BadOption("question.robot", f"is {robot!r}", "none with g2o, which has the whole map")
+    if robot is not None and format in _GRAPHS:
+        raise BadOption("question.robot", f"is {robot!r}", f"none with {format}, which has the whole map")
     strict = fields.flag("question", content, "strict")
-    if format != "g2o" and (strict or ids != "auto"):
+    if format in _GRAPHS and format != "g2o" and ids != "auto":
+        raise BadOption("question.ids", f"is {ids!r}", f"none with {format}, which has the keys themselves")
+    if format in _TRAJECTORIES and (strict or ids != "auto"):
         where, seen = ("strict", "is true") if strict else ("ids", f"is {ids!r}")
         raise BadOption(f"question.{where}", seen, f"none with {format}, which is a trajectory alone")
     return Question("export", format=format, robot=robot, strict=strict, ids=ids)
@@ -284,10 +286,15 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
 
 def _text(question: Question, batch: Batch) -> tuple[str, list[str]]:
     """(the file, what was left out of it).  Raises FormatError, SeveralRobots."""
-    from factorbus.formats import as_g2o, kitti_text, tum_notes, tum_text  # only who asks for an export pays for it
+    # Only who asks for an export pays for it.
+    from factorbus.formats import as_g2o, as_jrl, as_pyfg, kitti_text, tum_notes, tum_text
 
-    if question.format == "g2o":
-        written = as_g2o(batch, question.strict, question.ids)
+    if question.format in _GRAPHS:
+        strict = question.strict
+        if question.format == "g2o":
+            written = as_g2o(batch, strict, question.ids)
+        else:
+            written = {"pyfg": as_pyfg, "jrl": as_jrl}[question.format](batch, strict)
         return written.text, list(written.notes)
     if question.format == "tum":
         return tum_text(batch, question.robot), list(tum_notes(batch, question.robot))

@@ -1,0 +1,326 @@
+"""Read JRL files: `jrl` has the records."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorbus.formats.assemble import KIND_WORDS, EdgeColumns, VertexColumns, assembled
+from factorbus.formats.errors import FormatError, refuse_first
+from factorbus.formats.jrl import (
+    FACTORS,
+    GTSAM_ORDER,
+    OUTLIERS,
+    POTENTIAL_OUTLIERS,
+    PRIORS,
+    VALUES,
+    measured_numbers,
+    value_numbers,
+)
+from factorbus.formats.json_parts import Part, abridged, parsed_json
+from factorbus.formats.left_out import LeftOut
+from factorbus.formats.robot_log import FactorLabels, RobotLog, first_mentions
+from factorbus.formats.rotations import normalized_poses
+from factorbus.formats.weights import checked_information, doubled_rotations, inverted_weights, packed_upper
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.messages import Batch, Variables
+from factorbus.proto.stamps import LEAST_STAMP, MOST_STAMP, NO_STAMP
+from factorbus.proto.symbols import MAX_KEY, format_symbol
+
+_SYMMETRIC = 1e-6  # of the largest entry: files have at least six digits
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """What a robot measured at a time; number: its place among the entries of the robot."""
+
+    robot: str
+    number: int
+    stamp: int
+    measurements: list[Part]
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """A factor: its turn in the file, its keys, what was measured and its covariance (d²,), and where it stands."""
+
+    turn: int
+    keys: tuple[int, ...]
+    measured: list[float]
+    covariance: list[float]
+    entry: _Entry
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Value:
+    """The value of a variable: its turn in the file, its key and its numbers."""
+
+    turn: int
+    key: int
+    numbers: list[float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Values:
+    """Values by the name of their type, and the time stamps that stand beside them, None for one that has none."""
+
+    rows: dict[str, list[_Value]] = field(default_factory=lambda: defaultdict(list))
+    stamps: dict[int, int | None] = field(default_factory=dict)
+
+
+def is_jrl(content: bytes) -> bool:
+    """Whether a file is JSON, which no other form is."""
+    return content.lstrip()[:1] == b"{"
+
+
+def read_jrl(file: str, content: bytes, left: LeftOut) -> tuple[Batch, tuple[I64, ...], RobotLog]:
+    """(the graph, the turn of each factor for each group of factors, the log that it is of).
+
+    Measurements take turns by the stamps of their entries.  These are the time stamps of the poses that they are the
+    first to name, unless all are 0.  Raises FormatError, which names the place in the file.
+    """
+    document = parsed_json(file, content)
+    places: list[Part] = []  # what takes turn 0, 1, 2 ...
+    entries = _entries(document)
+    rows = _rows(entries, places, left)
+    values, truth = (_values(document, name, places, left) for name in ("initialization", "groundtruth"))
+    _refuse_clashes(rows, values, places)
+    with _placed(places):
+        edges = [_edges(file, name, of) for name, of in rows.items()]
+        vertices, known = ([_vertices(file, *each) for each in of.rows.items()] for of in (values, truth))
+        batch, turns = assembled(file, True, False, vertices, edges, None)
+    name = document.find("name")
+    true = Batch(tuple(Variables(of.kind, of.ids, of.values) for of in known))
+    log = RobotLog(
+        "" if name is None else name.text(),
+        _labels(document, entries, rows, turns),
+        _stamped(true, entries, rows, {**values.stamps, **truth.stamps}).variables,
+    )
+    if told := log.told():
+        left.say(told)
+    return _stamped(batch, entries, rows, values.stamps), turns, log
+
+
+def _robots(part: Part | None) -> Iterator[tuple[str, Part]]:
+    """The members of an object that has one for each robot.  Raises FormatError."""
+    for letter, of in (part.members() if part else {}).items():
+        if len(letter) != 1 or not letter.isascii():
+            raise of.refused("robots that are a letter each", f"the robot {abridged(letter)!r}")
+        yield letter, of
+
+
+def _listed(part: Part | None) -> list[Part]:
+    """What is in an array; nothing where there is none: programs of JRL write null for an empty one."""
+    return [] if part is None or part.value is None else part.items()
+
+
+def _entries(document: Part) -> list[_Entry]:
+    """The entries of all robots by their stamps; those of one stamp in the order of the file.  Raises FormatError."""
+    entries = []
+    for robot, part in _robots(document.member("measurements")):
+        for number, entry in enumerate(_listed(part)):
+            stamp = entry.member("stamp").whole(0, MOST_STAMP)
+            entries.append(_Entry(robot, number, stamp, _listed(entry.find("measurements"))))
+    return sorted(entries, key=lambda entry: entry.stamp)
+
+
+def _rows(entries: list[_Entry], places: list[Part], left: LeftOut) -> dict[str, list[_Row]]:
+    """Measurements by the name of their type.  Raises FormatError."""
+    rows: dict[str, list[_Row]] = defaultdict(list)
+    foreign: dict[str, list[Part]] = defaultdict(list)
+    for entry in entries:
+        for number, part in enumerate(entry.measurements):
+            name = part.member("type").text()
+            if name in FACTORS:
+                rows[name].append(_row(name, part, entry, number, len(places)))
+                places.append(part)
+            else:
+                foreign[name].append(part)
+    for name, parts in foreign.items():
+        left.drop(abridged(name), len(parts), f"no JRL measurement that is read; the first is {parts[0].place}")
+    return rows
+
+
+def _row(name: str, part: Part, entry: _Entry, number: int, turn: int) -> _Row:
+    dim = FACTOR_KINDS[FACTORS[name]].dim
+    keys = tuple(part.member(key).whole(0, MAX_KEY) for key in (("key",) if name in PRIORS else ("key1", "key2")))
+    measured = measured_numbers(name, part.member("prior" if name in PRIORS else "measurement"))
+    return _Row(turn, keys, measured, part.member("covariance").numbers(dim * dim), entry, number)
+
+
+def _values(document: Part, what: str, places: list[Part], left: LeftOut) -> _Values:
+    """The values of all robots in a member of the document.  Raises FormatError."""
+    found = _Values()
+    foreign: dict[str, list[Part]] = defaultdict(list)
+    seen: dict[int, tuple[str, list[float], Part]] = {}
+    for key, part in (each for _, of in _robots(document.find(what)) for each in _valued(of)):
+        name = part.member("type").text()
+        if name not in VALUES:
+            foreign[name].append(part)
+            continue
+        numbers = value_numbers(name, part)
+        before, its, where = seen.setdefault(key, (name, numbers, part))
+        if (before, its) != (name, numbers):
+            raise part.refused("one value for a key", f"{format_symbol(key)} again, other than at {where.place}")
+        if where is part:
+            found.rows[name].append(_Value(len(places), key, numbers))
+            places.append(part)
+        if "stamp" in part.value:
+            stamp = part.find("stamp")
+            found.stamps[key] = None if stamp is None else stamp.whole(LEAST_STAMP, MOST_STAMP)
+    for name, parts in foreign.items():
+        why = f"no JRL value that is read; the first is {parts[0].place}"
+        left.drop(f"{what} {abridged(name)}", len(parts), why)
+    return found
+
+
+def _valued(of_robot: Part) -> Iterator[tuple[int, Part]]:
+    """(key, value) of a robot, whether they are in an array or by their keys.  Raises FormatError."""
+    if not isinstance(of_robot.value, dict):
+        yield from ((value.member("key").whole(0, MAX_KEY), value) for value in _listed(of_robot))
+        return
+    for name, value in of_robot.members().items():
+        if not (name.isascii() and name.isdigit() and len(name) < 20 and int(name) <= MAX_KEY):
+            raise value.refused(f"a whole number from 0 to {MAX_KEY}", f"the key {abridged(name)!r}")
+        yield int(name), value
+
+
+def _refuse_clashes(rows: Mapping[str, list[_Row]], values: _Values, places: list[Part]) -> None:
+    """Refuse a key of two kinds of variables.  Raises FormatError."""
+    mentions = [
+        (row.turn, key, kind)
+        for name, of in rows.items()
+        for row in of
+        for key, kind in zip(row.keys, FACTOR_KINDS[FACTORS[name]].connects, strict=True)
+    ]
+    mentions += [(value.turn, value.key, VALUES[name]) for name, of in values.rows.items() for value in of]
+    kinds: dict[int, tuple[str, int]] = {}
+    for turn, key, kind in mentions:
+        before, first = kinds.setdefault(key, (kind, turn))
+        if before != kind:
+            seen = f"{format_symbol(key)} as {KIND_WORDS[kind]}, which is {KIND_WORDS[before]} at {places[first].place}"
+            raise places[turn].refused("one kind of variable for a key", seen)
+
+
+@contextmanager
+def _placed(places: list[Part]) -> Iterator[None]:
+    """Name the place of what is refused by its turn, in place of a line."""
+    try:
+        yield
+    except FormatError as error:
+        if error.line is None:
+            raise
+        raise places[error.line].refused(error.wanted, error.found) from error
+
+
+def _vertices(file: str, name: str, values: list[_Value]) -> VertexColumns:
+    turns = np.array([value.turn for value in values], np.int64)
+    numbers = np.array([value.numbers for value in values])
+    if VALUES[name] == "se3":
+        numbers = normalized_poses(file, name, turns, numbers)
+    return VertexColumns(VALUES[name], turns, np.array([value.key for value in values], np.int64), numbers)
+
+
+def _edges(file: str, name: str, rows: list[_Row]) -> EdgeColumns:
+    """In our terms and checked.  Raises FormatError."""
+    about = FACTOR_KINDS[FACTORS[name]]
+    turns, keys = np.array([row.turn for row in rows], np.int64), np.array([row.keys for row in rows], np.int64)
+    measured = np.array([row.measured for row in rows])
+    covariance = np.array([row.covariance for row in rows]).reshape(-1, about.dim, about.dim)
+    if keys.shape[1] == 2:
+        loops = keys[:, 0] == keys[:, 1]
+        refuse_first(
+            file,
+            turns,
+            loops,
+            lambda row: f"{name} from {format_symbol(int(keys[row, 0]))} to itself",
+            "two variables",
+        )
+    if "Range" in name:
+        bad = measured[:, -1] <= 0
+        refuse_first(file, turns, bad, lambda row: f"{name} of {measured[row, -1]:g}", "a distance above 0")
+    if about.size == 7:
+        measured = normalized_poses(file, name, turns, measured)
+    information = _information(file, name, turns, covariance)
+    return EdgeColumns(about.name, turns, keys, np.ascontiguousarray(measured), information)
+
+
+def _information(file: str, name: str, turns: I64, covariance: F64) -> F64:
+    """Information of whole covariances (n, d, d) in GTSAM's order, packed in ours.  Raises FormatError."""
+    about = FACTOR_KINDS[FACTORS[name]]
+    apart = np.abs(covariance - np.swapaxes(covariance, 1, 2)).max(axis=(1, 2))
+    askew = ~(apart <= _SYMMETRIC * np.abs(covariance).max(axis=(1, 2)))
+    wanted = "a symmetric positive definite matrix"
+    refuse_first(file, turns, askew, lambda row: f"{name} with a covariance matrix that is not symmetric", wanted)
+    if about.half_angles:
+        covariance = covariance[:, GTSAM_ORDER][:, :, GTSAM_ORDER]
+    packed = checked_information(file, name, turns, packed_upper(covariance), about.dim, "a covariance")
+    information = inverted_weights(packed, about.dim)
+    information = doubled_rotations(information) if about.half_angles else information
+    return np.ascontiguousarray(checked_information(file, name, turns, information, about.dim))
+
+
+def _stamped(
+    batch: Batch, entries: list[_Entry], rows: Mapping[str, list[_Row]], beside: Mapping[int, int | None]
+) -> Batch:
+    """The same with time stamps: those beside the values, and of poses those of the entries that first name them."""
+    named: dict[int, list[int]] = defaultdict(list)
+    for row in (row for of in rows.values() for row in of):
+        named[id(row.entry)] += row.keys
+    timed = any(entry.stamp for entry in entries)
+    stamps = first_mentions((entry.robot, entry.stamp, named[id(entry)]) for entry in entries) if timed else {}
+    groups = []
+    for group in batch.variables:
+        first = stamps if VARIABLE_KINDS[group.kind].is_pose else {}
+        times = [beside.get(key, first.get(key)) for key in group.keys.tolist()]
+        column = np.array([NO_STAMP if time is None else time for time in times], np.int64)
+        groups.append(group._replace(stamps=column) if (column != NO_STAMP).any() else group)
+    return Batch(tuple(groups), batch.factors)
+
+
+def _labels(
+    document: Part, entries: list[_Entry], rows: Mapping[str, list[_Row]], turns: tuple[I64, ...]
+) -> tuple[FactorLabels, ...]:
+    """What else is said of the factors.  Raises FormatError."""
+    by_turn = {row.turn: row for of in rows.values() for row in of}
+    potential, outlier = (_outliers(document, entries, name) for name in (POTENTIAL_OUTLIERS, OUTLIERS))
+
+    def flags(group: list[_Row], chosen: set[tuple[str, int, int]]) -> NDArray[np.bool]:
+        return np.array([(row.entry.robot, row.entry.number, row.number) in chosen for row in group], bool)
+
+    labels = []
+    for at in turns:
+        group = [by_turn[turn] for turn in at.tolist()]
+        stamps = np.array([row.entry.stamp for row in group], np.int64)
+        robots = np.array([ord(row.entry.robot) for row in group], np.int64)
+        labels.append(FactorLabels(stamps, robots, flags(group, potential), flags(group, outlier)))
+    return tuple(labels)
+
+
+def _outliers(document: Part, entries: list[_Entry], name: str) -> set[tuple[str, int, int]]:
+    """(robot, entry, measurement) of what is in a list of labels.  Raises FormatError."""
+    sizes = {(entry.robot, entry.number): len(entry.measurements) for entry in entries}
+    robots = {entry.robot for entry in entries}
+    part = document.find(name)
+    if part is not None and isinstance(part.value, list):  # as JRL's documents have it, which names no robot
+        if len(robots) > 1 and part.value:
+            raise part.refused("an object with an array for each robot", "an array, and several robots")
+        lists = [(robot, part) for robot in robots]
+    else:
+        lists = list(_robots(part))
+    found = set()
+    for robot, of in lists:
+        for pair in _listed(of):
+            ends = pair.items()
+            if len(ends) != 2:
+                raise pair.refused("[entry, measurement]", f"an array of {len(ends)}")
+            at, number = (end.whole(0, MOST_STAMP) for end in ends)
+            if number >= sizes.get((robot, at), 0):
+                raise pair.refused("[entry, measurement]", f"measurement {number} of entry {at}, which is not there")
+            found.add((robot, at, number))
+    return found
