@@ -179,10 +179,10 @@ def test_association_is_bounded_in_pairs_and_in_memory(memory: MemoryLimit) -> N
     made, one = many(Solver, 1500), np.zeros((1, 2))
     information = np.array([[1.0, 0, 1.0]])
 
-    def ask(sightings: int) -> bytes:
-        rows = np.repeat(one, sightings, axis=0)
+    def ask(observations: int) -> bytes:
+        rows = np.repeat(one, observations, axis=0)
         return asking_codec.encode_ask_associate(
-            AskAssociate(0, "landmark_se2", rows, np.repeat(information, sightings, axis=0))
+            AskAssociate(0, "landmark_se2", rows, np.repeat(information, observations, axis=0))
         )
 
     assert refused(made, "associate", ask(67), Room()).detail == {"size": 100_500, "limit": 100_000}

@@ -177,9 +177,9 @@ def bars() -> tuple[Solver, int]:
     solver.stage(Batch((poses,)))
     solver.step()
     angles = np.arctan2(5.0, 2.0 - 4.0 * keys)[:, None]
-    sights = Factors("bearing_se2", np.stack([keys, np.full(3, 10)], 1), angles, np.full((3, 1), 1e4))
+    observations = Factors("bearing_se2", np.stack([keys, np.full(3, 10)], 1), angles, np.full((3, 1), 1e4))
     point = Variables("point2", np.array([10]), np.array([[2.0, 5.0]]))
-    first = solver.stage(Batch((point,), (sights,)))
+    first = solver.stage(Batch((point,), (observations,)))
     solver.step()
     return solver, first
 
@@ -255,7 +255,7 @@ def test_what_fails_behind_the_step_is_undone(what: str, monkeypatch: pytest.Mon
     change = [Change("remove_factors", np.array([first])), robust]
     with monkeypatch.context() as broken:
         if what == "soundness":
-            broken.setattr("factorbus.solver.changes.in_place._is_sound", lambda *_: False)
+            broken.setattr("factorbus.solver.changes.in_place.is_sound", lambda *_: False)
             assert try_change(solver, change) is None
         else:
             broken.setattr(type(tree_of(solver)), "step", lambda *_: 1 / 0)

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_factors import jacobians, residual
+from naive.random_camera_factors import CAMERA_KINDS, random_camera_factor
 from naive.random_graphs import random_information, random_value
 from naive.random_others import OTHERS, random_other
-from naive.random_sights import SIGHTS, random_sight
 
 from factorbus.proto import kinds as wire
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -33,8 +33,8 @@ def drawn(kind: FactorKind, rng: np.random.Generator) -> np.ndarray:
 def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, FactorGraph]:
     """Values of the ends, a measurement far from them, and a graph of that one factor."""
     rng = np.random.default_rng(seed)
-    if kind.name in SIGHTS:
-        _, ends, z = random_sight(kind.name, rng)
+    if kind.name in CAMERA_KINDS:
+        _, ends, z = random_camera_factor(kind.name, rng)
     else:
         ends = [random_value(end.name, rng) for end in kind.connects]
         z = random_other(kind.name, ends, 1.0, rng) if kind.name in OTHERS else drawn(kind, rng)
@@ -63,7 +63,7 @@ def test_residual_is_the_twins(kind: FactorKind, seed: int) -> None:
     ends, z, graph = case(kind, seed)
     r, _ = evaluate(kind, graph)
     twin = residual(kind.name, ends, z)
-    near_turn = (np.abs(np.abs(twin) - np.pi) < 1e-9) & (kind.name not in SIGHTS)  # −π and π are the same angle
+    near_turn = (np.abs(np.abs(twin) - np.pi) < 1e-9) & (kind.name not in CAMERA_KINDS)  # −π and π are the same angle
     np.testing.assert_allclose(np.where(near_turn, np.abs(r), r), np.where(near_turn, np.abs(twin), twin), atol=1e-9)
 
 
@@ -72,7 +72,7 @@ def test_residual_is_the_twins(kind: FactorKind, seed: int) -> None:
 def test_jacobians_are_the_twins_central_differences(kind: FactorKind, seed: int) -> None:
     ends, z, graph = case(kind, seed)
     r, found = evaluate(kind, graph)
-    if kind.name in SIGHTS:
+    if kind.name in CAMERA_KINDS:
         for J, twin in zip(
             found, jacobians(kind.name, [end.name for end in kind.connects], ends, z, 1e-4), strict=True
         ):

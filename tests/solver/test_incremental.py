@@ -38,14 +38,14 @@ WAYS = {
 def assert_is_the_factor(solver: Solver, relative: float = 1e-9) -> bool:
     """RᵀR = PΛPᵀ, d = R⁻ᵀPη, and δ by blocks is the dense solution; False: there is no R in block rows."""
     factor = system_in(solver).factor
-    if factor._have is not Where.ROWS:
+    if factor.where is not Where.ROWS:
         return False
     information, eta = dense_lambda(solver)
     R, order, d = dense_r(factor.rows)
     permuted = information[np.ix_(order, order)]
     scale = np.abs(permuted).max()
     np.testing.assert_allclose(R.T @ R, permuted, rtol=0, atol=relative * scale)
-    if factor._rows_have_d:
+    if factor.rows_have_d:
         # η may vanish, but not the rounding errors of residuals of size one.
         np.testing.assert_allclose(R.T @ d, eta[order], rtol=0, atol=relative * max(np.abs(eta).max(), scale * 1e-6))
     delta = factor.rows.back(np.linalg.solve(R.T, eta[order]))
@@ -95,7 +95,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
     """A chain of poses with loops of drawn lengths, several in a step at times; in the plane or in space."""
     plane = draw(st.booleans())
     pose, between = ("se2", "between_se2") if plane else ("se3", "between_se3")
-    point, sight = ("point2", "landmark_se2") if plane else ("point3", "landmark_se3")
+    point, observation = ("point2", "landmark_se2") if plane else ("point3", "landmark_se3")
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     truth: dict[int, np.ndarray] = {0: np.zeros(3) if plane else np.array([0, 0, 0, 0, 0, 0, 1.0])}
     steps = [Batch((Variables(pose, np.array([0]), truth[0][None], fixed=True),))]
@@ -118,7 +118,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
             points.append(key)
         if what != "nothing" and points:
             seen = points[-1] if what == "new point" else points[draw(st.integers(0, len(points) - 1))]
-            factors.append(factor(sight, [n, seen], truth, 0.02, rng))
+            factors.append(factor(observation, [n, seen], truth, 0.02, rng))
         steps.append(Batch(tuple(variables), tuple(factors)))
     return steps
 
@@ -192,8 +192,8 @@ def test_a_refused_step_leaves_values_and_graph_and_the_map_goes_on() -> None:
         if n % 3 == 2:
             before = [group.values.tobytes() for group in solver.estimate()], solver.chi2(), solver.factor_count
             free = Variables("se2", np.array([-7]), np.zeros((1, 3)))
-            sight = Factors("landmark_se2", np.array([[-7, -8]]), np.ones((1, 2)), np.array([[1.0, 0, 1]]))
-            solver.stage(Batch((free, Variables("point2", np.array([-8]), np.ones((1, 2)))), (sight,)))
+            observation = Factors("landmark_se2", np.array([[-7, -8]]), np.ones((1, 2)), np.array([[1.0, 0, 1]]))
+            solver.stage(Batch((free, Variables("point2", np.array([-8]), np.ones((1, 2)))), (observation,)))
             with pytest.raises(errors.Underconstrained):
                 solver.step()
             assert before == (

@@ -54,8 +54,8 @@ class GraphFile:
         """All steps as one insert, with the first pose fixed where the file leaves the choice.  Raises FormatError."""
         return planned_whole(self.path, *self._joined(), use_values)
 
-    def account(self, whole: bool = False) -> dict[str, object]:
-        """A program's account of how the file was read; whole: of all in `batch`, not of what a replay drives."""
+    def summary(self, whole: bool = False) -> dict[str, object]:
+        """A program's summary of how the file was read; whole: of all in `batch`, not of what a replay drives."""
         left_out = {name: count for name, count in self.left_out.items() if not (whole and name in _IN_NO_STEP)}
         return {"dialect": self.dialect, "notes": list(self.notes), "left_out": left_out}
 

@@ -185,7 +185,7 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> 
     A pose is reached over an edge from a pose that is in.  When there is none, a pose that sees a point that is in,
     or a fixed one, is let in at the value its vertex line gives, if it has one; and so is a body that ranges determine.
     """
-    edges, sightings = _neighbours(_pairs(batch, names, False)), _neighbours(_pairs(batch, names, True))
+    edges, observations = _neighbours(_pairs(batch, names, False)), _neighbours(_pairs(batch, names, True))
     entry = np.full(len(names.keys), -1, np.int64)
     known = set(np.flatnonzero(names.fixed & ~names.is_pose).tolist())
     given: list[int] = []
@@ -195,19 +195,19 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> 
 
     def enter(turn: int, first: int) -> list[int]:
         """Let `first` in and all poses that had been waiting for it; what may be let in now."""
-        waiting, sighted = [first], []
+        waiting, observed = [first], []
         while waiting:
             pose = waiting.pop()
             if entry[pose] >= 0:
                 continue
             entry[pose] = turn
-            sighted += ranges.of(pose)
+            observed += ranges.of(pose)
             waiting += [other for other in edges[pose] if entry[other] < 0 and names.rank[other] <= turn]
-            for point in sightings[pose]:
+            for point in observations[pose]:
                 if point not in known:
                     known.add(point)
-                    sighted += [*sightings[point], *ranges.of(point)]
-        return sighted
+                    observed += [*observations[point], *ranges.of(point)]
+        return observed
 
     def body_of(row: int, turn: int) -> list[int]:
         """A point alone, or the poses so far that odometry joins to a pose."""
@@ -227,7 +227,7 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> 
             ready = names.rank[late] <= turn and entry[late] < 0 and names.valued[late]
             if not ready or not (names.is_pose[late] or ranges.lone[late]):
                 continue
-            sees = names.is_pose[late] and any(point in known for point in sightings[late])
+            sees = names.is_pose[late] and any(point in known for point in observations[late])
             if sees or (ranges and ranges.determine(body_of(late, turn), is_in)):
                 given.append(late)
                 candidates += enter(turn, late)
@@ -275,9 +275,9 @@ def _enter_points(batch: Batch, names: Roster, entry: I64, ranges: Ranges) -> No
     """Entries of points that not only ranges see: with the first pose that does; of unseen ones that are known, at the
     start.
     """
-    sightings = _pairs(batch, names, points=True)
+    observations = _pairs(batch, names, points=True)
     first = np.full(len(entry), np.iinfo(np.int64).max)
-    seen = sightings[entry[sightings[:, 0]] >= 0]
+    seen = observations[entry[observations[:, 0]] >= 0]
     np.minimum.at(first, seen[:, 1], entry[seen[:, 0]])
     points = ~names.is_pose & ~ranges.lone
     known = names.fixed.copy()
