@@ -368,7 +368,7 @@ def test_diagonal_blocks_are_kept_up_over_changes() -> None:
         upkeep.update()
         wanted = CovarianceBlocks(solver.covariances.factored()).diagonal()
         np.testing.assert_allclose(upkeep.diagonal()[:, :3, :3], wanted, rtol=1e-7, atol=1e-12)
-    assert upkeep.whole < upkeep.anew
+    assert (upkeep.whole, upkeep.anew) == (1, 13), "the first of them only goes through the whole tree"
 
 
 @pytest.mark.parametrize("mode", ["inc-l", "all-batch"])
