@@ -129,6 +129,7 @@ def random_change(solver: Solver, rng: np.random.Generator, weighed: list[Change
 @pytest.mark.parametrize("seed", range(2))
 def test_after_any_changes_the_map_is_that_of_the_factors_that_are_left(seed: int, world: str) -> None:
     rng, solver, weighed = np.random.default_rng(seed), Solver(Options(wildfire_threshold=0.0)), list[Change]()
+    made = compared = 0
     for batch in WORLDS[world](seed % 1000):
         solver.stage(batch)
         solver.step()
@@ -162,11 +163,14 @@ def test_after_any_changes_the_map_is_that_of_the_factors_that_are_left(seed: in
             here, there = copied(solver), copied(anew)
             for each in (here, there):
                 each.step(settle=True)
+            made += 1
             if here.chi2() == pytest.approx(there.chi2(), rel=1e-3, abs=1e-9):  # else these are two optima
                 assert here.chi2() == pytest.approx(there.chi2(), rel=1e-6 if world == "robots" else 1e-4, abs=1e-9)
                 assert apart(here, there) < 1e-6 or world != "robots"  # cameras hardly hold some directions
                 plain = not any(row[-2] for row in rows_of(solver).values())  # weights of losses converge slowly
                 assert report.chi2 <= 1.02 * here.chi2() + 1e-2 or not (report.converged and plain)
+                compared += 1
+    assert compared >= made - 1 > 3, "nearly all led to one optimum"
 
 
 def bars() -> tuple[Solver, int]:
