@@ -329,8 +329,8 @@ def test_a_map_with_nothing_to_do_finishes(world: str, mode: str) -> None:
     before = [group.values.tobytes() for group in solver.estimate()]
     report = solver.step()
     assert (report.converged, solver.unfinished) == (True, False)
-    if [group.values.tobytes() for group in solver.estimate()] != before:  # to the last bit there may be something left
-        assert optimum * (1 - 1e-6) <= report.chi2 <= report.chi2_before
+    assert [group.values.tobytes() for group in solver.estimate()] == before
+    assert report.chi2 == pytest.approx(optimum, rel=1e-6)
 
 
 @pytest.mark.parametrize("mode", MODES)
