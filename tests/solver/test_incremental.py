@@ -23,6 +23,7 @@ from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.inc_l.incremental import Where
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.modes import MODES
 from factorbus.solver.report import StepReport
 from factorbus.solver.sparse.elimination import constraint
@@ -242,7 +243,7 @@ def test_orders_by_block_and_by_element_fill_alike(datasets: Path, name: str) ->
         solver.stage(batch)
     solver.step()
     graph, blocks = graph_in(solver), system_in(solver).blocks
-    dims = graph.dims[: graph.counts[4]]
+    dims = graph.dims[: graph.counts[at.COLUMNS]]
     free, bound = (
         fill_in(dims, blocks.rows, blocks.cols, group)[0] for group in (None, constraint(graph, recent_poses=1))
     )

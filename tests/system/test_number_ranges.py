@@ -54,13 +54,13 @@ def messages() -> dict[str, tuple[str, bytes]]:
     camera = Camera("radtan", (500.0, 500, 320, 240, 0, 0, 0, 0), 640, 480)
     state = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], float)
     observations = Observations(camera, state, np.eye(13), np.array([[300.0, 200.0]]), 0.5, 0.2, 1.0)
-    observations = AskAssociate(int(x[1]), "landmark_se2", np.ones((1, 2)), np.array([[1.0, 0, 1.0]]), l1, 0.9)
+    seen = AskAssociate(int(x[1]), "landmark_se2", np.ones((1, 2)), np.array([[1.0, 0, 1.0]]), l1, 0.9)
     asked = {
         "estimate": codec.encode_keys_asked(x),
         "chi2": codec.encode_map({"batch": False, "timeout_s": 5.0}),
         "export": codec.encode_map({"format": "g2o"}),
         "gate": asking_codec.encode_ask_gate(AskGate((soft,), 0.9)),
-        "associate": asking_codec.encode_ask_associate(observations),
+        "associate": asking_codec.encode_ask_associate(seen),
         "repair": repair_codec.encode_ask_repair(AskRepair(np.array([1]), 0.9, True)),
         "covariance": asking_codec.encode_ask_covariance(AskCovariance("cross", x, l1)),
     }
