@@ -51,7 +51,7 @@ test-data: $(READY_DEV) ## the long tests on the public data sets (FACTORBUS_DAT
 
 # Compiled code neither checks an index nor counts as covered.  Each way has kernels of its own in the cache.
 KERNEL_TESTS := tests/solver/test_factor_kinds.py tests/solver/test_cholesky_kernels.py tests/solver/test_few.py \
-	tests/solver/test_sights.py tests/workers/test_idp_lenses.py tests/workers/test_idp_features.py
+	tests/solver/test_observations.py tests/workers/test_idp_lenses.py tests/workers/test_idp_features.py
 # A kernel that counts from the end of an array without saying so would read what is before it.
 CHECKED_TESTS := tests/solver/test_solver_steps.py tests/solver/test_tree.py tests/solver/test_covariance.py \
 	tests/solver/test_joints.py tests/solver/test_worker_threads.py tests/solver/test_columns.py tests/solver/test_renew.py \

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from factorbus.service.config import load_config
-from factorbus.service.core.account import Histogram
+from factorbus.service.core.statistics import Histogram
 from factorbus.service.operations.metrics import families
 
 DEPLOY = Path(__file__).parent.parent / "deploy"
@@ -36,14 +36,14 @@ def known() -> set[str]:
     row = dict.fromkeys([*_NUMBERS, "steps", "solver_cpu_s"], 1)
     row |= {"name": "m", "step_s": Histogram().as_dict(), "insert_s": Histogram().as_dict()}
     row |= {name: {"x": 1} for name in ("strategies", "inserts", "refusals", "bytes")}
-    account = {
+    health = {
         "service": "s", "version": "1", "uptime_s": 1.0, "alive": True, "ready": True, "silent_s": {"watch": 0.0},
         "memory": {"resident_bytes": 1, "limit_bytes": 2}, "maps": [row | {"journal": {"bytes": 3, "blocked": 0}}],
         "workers": [{"name": "w", "slots": 1, "in_flight": 0, "latency_ms": 0.2}],
         "cores": {"used": 2, "pieces": 7},
     }  # fmt: skip
     names = set()
-    for family in families(account):
+    for family in families(health):
         ends = {"counter": ("_total",), "histogram": ("_bucket", "_sum", "_count")}.get(family.kind, ("",))
         names |= {f"factorbus_{family.name}{end}" for end in ends}
     return names

@@ -9,6 +9,7 @@ SOURCES = ("proto", "service", "workers", "clients")
 MOST_PARAMETERS = 8
 MOST_LINES = 400
 INTEGERS = {"I8", "I16", "I32", "I64", "U8", "U32", "U64", "Ints", "IntRows"}
+COUNTERS = {"counts", "state"}  # one row, whose columns have names
 ALLOCATES = {"empty", "zeros", "full"}
 # Bits of words in three arrays of words, which are no columns.
 NO_TABLES = {("service/factorbus/solver/kernels/bayes_tree/order_small.py", "planes")}
@@ -64,6 +65,27 @@ def test_no_column_of_a_table_is_called_by_a_number() -> None:
     assert sorted(found - NO_TABLES) == []
 
 
+def test_no_column_is_called_by_a_number_outside_kernels_and_in_tests() -> None:
+    """There a column is `graph.var[…, 3]` or `graph.counts[4]`; one index alone is a row."""
+    records = set(record_tables())
+    found = {
+        (called(path), name)
+        for path in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]
+        if "kernels" not in path.parts and path != Path(__file__).resolve()
+        for name in columns_from_outside(ast.parse(path.read_text(encoding="utf-8")), records)
+    }
+    assert sorted(found) == []
+
+
+def columns_from_outside(module: ast.AST, records: set[str]) -> Iterator[str]:
+    """Columns of records' arrays that are read or written at a literal from 2 on."""
+    for node in ast.walk(module):
+        match node:
+            case ast.Subscript(value=ast.Attribute(attr=name), slice=index) if name in records and is_number(index):
+                if isinstance(index, ast.Tuple) or name in COUNTERS:
+                    yield ast.unparse(node)
+
+
 def record_tables() -> Iterator[str]:
     """Names of the fields of records that are arrays of integers."""
     for path in sources():
@@ -109,3 +131,8 @@ def test_the_walk_sees_what_it_is_to_see() -> None:
     (kernel,) = [node for node in ast.walk(function) if isinstance(node, ast.FunctionDef)]
     assert [each.arg for each in parameters(kernel)] == ["a", "b", "c"]
     assert sorted(numbered_columns(kernel, {"rows"})) == ["a", "clique.rows", "rows"]
+    outside = ast.parse("graph.var[v, 3] = graph.counts[4] + graph.keys[5] + graph.fac[:, 1] + matrix.T[2, 2]")
+    assert sorted(columns_from_outside(outside, {"var", "counts", "keys", "fac"})) == [
+        "graph.counts[4]",
+        "graph.var[v, 3]",
+    ]

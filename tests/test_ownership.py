@@ -92,7 +92,7 @@ def test_volumes_of_containers(
     owner: int, group: int, mode: int, safe: bool, monkeypatch: pytest.MonkeyPatch, folder: Path
 ) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: ANOTHER)
-    reason, _ = folders._why_unsafe_itself(folder, status(owner, group, mode), {10001})
+    reason, _ = folders.why_unsafe_itself(folder, status(owner, group, mode), {10001})
     assert (reason == "") is safe, reason
 
 

@@ -15,6 +15,8 @@ SOURCES = ("proto", "service", "clients", "workers")
 NAME_PARTS = (
     "errand", "courier", "ticket", "promise", "desk", "seat", "vitals", "lender", "doubt", "fold", "folds", "folded",
     "lookout", "polite", "discreet", "slip", "strain", "ripen", "ripe", "lacking", "sightseeing", "gauges", "whoever",
+    "sight", "sights", "sighted", "sighting", "sightings", "border", "borders", "account", "accounts", "judged",
+    "grown", "burden", "dearness", "glide",
 )  # fmt: skip
 NAMES = ("Folder", "Run", "Alone", "Judged", "Located", "Lane", "Trips", "Shares", "Lent", "Memories", "take_in",
     "Place", "Asked", "Told",
@@ -22,10 +24,12 @@ NAMES = ("Folder", "Run", "Alone", "Judged", "Located", "Lane", "Trips", "Shares
 # Of the wire, options and statistics: whole words.
 FIELDS = (
     "folded", "asleep", "points_below", "keyframe_key", "trip_ms", "lacking", "relinearised", "desk", "bent",
-    "look_every", "ripple", "trust", "reluctance", "detour", "patience",
+    "look_every", "ripple", "trust", "reluctance", "detour", "patience", "sightings", "border", "account",
 )  # fmt: skip
 PROSE = re.compile(
-    r"\b(errands?|courier|desk|lender|lookout|ripen|asleep|points_below|take_in|sightseeing|trip_ms)\b", re.IGNORECASE
+    r"\b(errands?|courier|desk|lender|lookout|ripen|asleep|points_below|take_in|sightseeing|trip_ms"
+    r"|sights?|sightings?|borders?)\b",
+    re.IGNORECASE,
 )
 # As the reference pages and the command line's help have it: a value is reported, a process notified, an error shown.
 TOLD = re.compile(r"\b(is told|are told|was told|were told|whoever|so many)\b", re.IGNORECASE)
@@ -37,12 +41,14 @@ BRITISH = re.compile(
 
 
 def public_names(tree: ast.Module) -> Iterator[str]:
-    """Classes, functions, parameters, fields and constants of a module that do not begin with an underscore."""
+    """Of a module: classes, functions, parameters, fields, constants; arguments by name, as a problem's detail has."""
     for node in ast.walk(tree):
         match node:
             case ast.ClassDef(name=name) | ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
                 yield name
             case ast.arg(arg=name):
+                yield name
+            case ast.keyword(arg=str(name)):
                 yield name
             case ast.AnnAssign(target=ast.Name(id=name)):
                 yield name

@@ -163,7 +163,7 @@ def _about_uncertainty(solver: Solver, report: dict[str, Any]) -> dict[str, byte
         Factors("between_se2", np.array([[X[1], X[2]], [X[0], X[1]]]), np.array([[1.5, 0.25, 0.25], [2.5, 0.0, 0.0]]),
                 np.array([POSE] * 2)),
     )  # fmt: skip
-    sights = np.array([[1.0, -0.625], [6.0, 6.0]])
+    observations = np.array([[1.0, -0.625], [6.0, 6.0]])
     questions = {
         "covariances": ("ask_covariance", asking.AskCovariance()),
         "covariances_joint": ("ask_covariance_joint", asking.AskCovariance("joint", np.array([X[1], L[1]]))),
@@ -179,7 +179,7 @@ def _about_uncertainty(solver: Solver, report: dict[str, Any]) -> dict[str, byte
         "gained": ("ask_gain", asking.AskGain(candidates)),
         "associated": (
             "ask_associate",
-            asking.AskAssociate(X[2], "landmark_se2", sights, np.array([POINT] * 2), np.array(L), 0.95),
+            asking.AskAssociate(X[2], "landmark_se2", observations, np.array([POINT] * 2), np.array(L), 0.95),
         ),
         "why": ("ask_why_factor", asking.AskWhy(factor=FALSE)),
         "why_variable": ("ask_why", asking.AskWhy(key=X[1])),

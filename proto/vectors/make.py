@@ -36,7 +36,7 @@ from factorbus.proto.symbols import symbol
 _KITCHEN = runpy.run_path(str(Path(__file__).with_name("kitchen.py")))
 _COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64", "scale": "f64"}
 # Of the questions about uncertainty and their answers, §16.
-_COLUMNS |= dict.fromkeys(("others", "dims", "other_dims", "landmarks", "sightings", "candidates"), "i64")
+_COLUMNS |= dict.fromkeys(("others", "dims", "other_dims", "landmarks", "observations", "candidates"), "i64")
 _COLUMNS |= dict.fromkeys(("covariance", "distance", "threshold", "gain", "distances"), "f64")
 _COLUMNS |= dict.fromkeys(("plausible", "matched"), "u8")
 # Of changes and repairs, §17.
@@ -63,7 +63,7 @@ def vectors() -> dict[str, bytes]:
             for name, kind in FACTOR_KINDS.items()
         },
         "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
-        "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
+        "insert_observations": codec.encode_insert(Insert(5, _observations(), epoch=7)),
         "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
         "insert_mounts": codec.encode_insert(Insert(10, _mounts(), epoch=7)),
         "insert_linear_kinds": codec.encode_insert(Insert(9, _linear_kinds(), epoch=7)),
@@ -219,7 +219,7 @@ def _mounts() -> Batch:
     return Batch(factors=tuple(groups))
 
 
-def _sights() -> Batch:
+def _observations() -> Batch:
     """What cameras see, with and without losses."""
     x, f, p = (symbol(letter, 1) for letter in "xfp")
     unit2, unit6 = (np.array([np.eye(r)[np.triu_indices(r)]]) for r in (2, 6))

@@ -22,6 +22,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from naive.solver_parts import graph_in
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core for everybody
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -55,7 +57,7 @@ def main() -> None:
 def run(poses: int) -> dict[str, Any]:
     """Everything, as a document; `poses`: of each data set, 0: all."""
     warm()
-    city, manhattan = _problem("city10000", poses), _problem("manhattan3500", poses)
+    city, manhattan = problem_named("city10000", poses), problem_named("manhattan3500", poses)
     found = {"poses": poses, "large": _large(city), "every_step": _every_step(manhattan)}
     found["targets"] = targets(found)
     return found
@@ -109,7 +111,7 @@ def _large(problem: Problem) -> dict[str, Any]:
     batch.step()
     whole = OurPass(batch)
     pass_ms = min(1e3 * whole.run()[0]["total"] for _ in range(_REPEAT))
-    gtsam_ms, worst = _gtsam(solver, fresh[0].diagonal())
+    gtsam_ms, worst = time_gtsam(solver, fresh[0].diagonal())
     return {
         "name": problem.label,
         "variables": solver.variable_count,
@@ -156,7 +158,7 @@ def _every_step(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _gtsam(
+def time_gtsam(
     solver: Solver, diagonal: np.ndarray, between: Callable[..., Any] = gtsam.BetweenFactorPose2
 ) -> tuple[float, float]:
     """(milliseconds of a loop over all poses, largest relative difference of a block) of GTSAM's Marginals.
@@ -179,7 +181,7 @@ def _gtsam(
             information = information + np.triu(information, 1).T
             noise = gtsam.noiseModel.Gaussian.Information(information)
             graph.add(between(i, j, gtsam.Pose2(*z), noise))
-    keys = solver._graph.keys[: solver.variable_count].tolist()
+    keys = graph_in(solver).keys[: solver.variable_count].tolist()
     blocks: list[np.ndarray] = []
 
     def loop() -> None:
@@ -187,7 +189,7 @@ def _gtsam(
         blocks.extend(marginals.marginalCovariance(key) for key in keys)
 
     took = _ms(loop)
-    free = solver._graph.var[: solver.variable_count, at.V_COLUMN] >= 0
+    free = graph_in(solver).var[: solver.variable_count, at.V_COLUMN] >= 0
     return took, _worst(diagonal[free][:, :3, :3], np.array(blocks)[free])
 
 
@@ -197,7 +199,7 @@ def _candidates(solver: Solver, spread: bool = False) -> Factors:
     first = rng.integers(1, count - 1, _CANDIDATES) if spread else np.full(_CANDIDATES, count - 1)
     second = rng.integers(1, count - 1, _CANDIDATES) if spread else 1 + np.arange(_CANDIDATES) % (count - 2)
     second[second == first] -= 1
-    keys = solver._graph.keys[np.column_stack([first, second])]
+    keys = graph_in(solver).keys[np.column_stack([first, second])]
     weight = np.tile([100.0, 0, 0, 100.0, 0, 1000.0], (_CANDIDATES, 1))
     return Factors("between_se2", keys, rng.normal(0, 1, (_CANDIDATES, 3)), weight)
 
@@ -225,7 +227,7 @@ def _ms(work: Callable[[], Any]) -> float:
     return 1e3 * (time.thread_time() - start)
 
 
-def _problem(name: str, poses: int) -> Problem:
+def problem_named(name: str, poses: int) -> Problem:
     (found,) = [problem for problem in ALL if problem.name == name]
     return found.shortened(poses) if poses else found
 

@@ -22,7 +22,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from bench.replays.problems import ALL, Problem, choose, load
-from naive.random_sightings import CAMERAS, random_sighting
+from naive.random_cameras import CAMERAS, random_observations
 
 from factorbus import idp
 from factorbus.idp import classical, independent, minimal
@@ -46,7 +46,7 @@ _ACCOUNT = (
     "converged",
 )
 _CLOSE = 1e-9
-_SIGHTINGS = ((1, 0), (3, 0), (7, 1), (2, 30), (5, 120))  # new and present features
+_OBSERVATIONS = ((1, 0), (3, 0), (7, 1), (2, 30), (5, 120))  # new and present features
 
 Row = dict[str, Any]
 
@@ -105,14 +105,14 @@ def _covariances() -> tuple[Row, np.ndarray]:
     """Covariance blocks of new features, each way of computing them and every camera."""
     account, bits, found = hashlib.blake2b(digest_size=8), hashlib.blake2b(digest_size=8), []
     for camera in CAMERAS:
-        for n, existing in _SIGHTINGS:
-            sighting, P = random_sighting(n, n, existing, camera)
-            seen, padd = idp.see(sighting), idp.padd(sighting)
-            A, B = idp.jacobians(sighting, seen)
+        for n, existing in _OBSERVATIONS:
+            observations, P = random_observations(n, n, existing, camera)
+            seen, padd = idp.see(observations), idp.padd(observations)
+            A, B = idp.jacobians(observations, seen)
             for counted in (
                 classical.covariance(P, A, B, padd),
                 independent.covariance(P, A, B, padd),
-                minimal.covariance(P, sighting, seen),
+                minimal.covariance(P, observations, seen),
             ):
                 account.update(repr(counted.multiplications).encode())
                 bits.update(counted.P.tobytes())

@@ -129,7 +129,7 @@ class _Map:
                 if taken := [each.insert for each in event.outcomes if isinstance(each.answer, bytes)]:
                     self.accepted.append(taken)
                     self._took = True
-                self._perform(self.core.judged(event))
+                self._perform(self.core.give_verdict(event))
             elif isinstance(event, Stepped):
                 self._perform(self.core.stepped(event))
             elif isinstance(event, Applied):

@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 
 from factorbus import idp
 from factorbus.client import Bus, Features, Growing, Map, connect
@@ -72,11 +72,11 @@ class Front:
 
     def __init__(self, bus: Bus, watch: Map) -> None:
         self._watch = watch
-        self._sighting, self._P = random_sighting(5, _FEATURES)
-        prior = {name: getattr(self._sighting, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
-        self._features: Features = bus.features(self._sighting.camera, **prior)
-        seen = idp.see(self._sighting)
-        self._expected = minimal.covariance(self._P, self._sighting, seen).P
+        self._observations, self._P = random_observations(5, _FEATURES)
+        prior = {name: getattr(self._observations, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
+        self._features: Features = bus.features(self._observations.camera, **prior)
+        seen = idp.see(self._observations)
+        self._expected = minimal.covariance(self._P, self._observations, seen).P
 
     def run(self, seconds: float) -> float:
         """Questions per second."""
@@ -109,7 +109,7 @@ class Front:
         return self._watch.stats()["workers"][0]
 
     def _send(self) -> Growing:
-        return self._features.send(self._sighting.state, self._P, self._sighting.pixels)
+        return self._features.send(self._observations.state, self._P, self._observations.pixels)
 
 
 @contextmanager

@@ -1,9 +1,9 @@
 """A camera among points, estimated in a map with `idp` features through a service, and how honest the map is.
 
 A front end that knows pixels and tracks only: a new camera is placed by steady motion, a feature begins when its track
-has gone smoothly for three frames, every later pixel is a sight with a robust loss.  The gauge is the first pose, the
-scale a target in view of the first frame whose distances are known, as in MonoSLAM.  Nothing else joins the poses.
-At the end the map is held against the truth by the covariances of a dense inverse.
+has gone smoothly for three frames, every later pixel is an observation with a robust loss.  The gauge is the first
+pose, the scale a target in view of the first frame whose distances are known, as in MonoSLAM.  Nothing else joins the
+poses. At the end the map is held against the truth by the covariances of a dense inverse.
 """
 
 import time
@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from bench import idp_bus
 from naive.dense_factors import boxplus, pose_matrix, pose_vector
+from naive.solver_parts import graph_in, system_in
 
 from factorbus.client import Draft, Map, connect
 from factorbus.proto.messages import Batch
@@ -27,7 +28,7 @@ _RHO, _SIGMA_RHO = 0.35, 0.25
 _TARGET, _TARGET_SHARE = 8, 0.01
 _SMOOTH_PX = 6.0  # how far a track may be from where its last two pixels lead
 _FAR_OFF_PX = 40.0  # how far a pixel may be from where the map has its feature
-_LASTING = 10  # sights of a feature that is judged
+_LASTING = 10  # observations of a feature that is judged
 _WITHIN = {1: 9.0, 3: 14.16, 6: 20.06}  # χ² that is as rare as 3σ
 
 
@@ -45,7 +46,7 @@ class Track:
 
     pixels: dict[int, np.ndarray] = field(default_factory=dict)
     first: int = -1
-    sights: int = 0
+    observations: int = 0
     outliers: int = 0
 
 
@@ -53,20 +54,20 @@ class FrontEnd:
     """Tells a map what a camera sees."""
 
     def __init__(self, world: MonocularWorld, target: Target, convert_below: float = 0.0, every: int = 20) -> None:
-        self._world, self._map, self._below, self._every = world, target, convert_below, every
+        self.world, self._map, self._below, self._every = world, target, convert_below, every
         self.tracks: dict[int, Track] = {}
         self.poses: list[np.ndarray] = []  # true ones
         self._sigma = world.sigma_pixel
 
     def run(self) -> None:
         """All frames, then until converged."""
-        for number, frame in enumerate(self._world):
+        for number, frame in enumerate(self.world):
             draft = Draft()
             if number == 0:
                 self._begin(draft, frame)
             else:
                 draft.se3(symbol("x", number), self._ahead(number))
-                self._sights(draft, number, frame)
+                self._observations(draft, number, frame)
             self.poses.append(frame.pose)
             below = self._below if number % self._every == 0 else 0.0
             self._map.insert(draft, convert_below=below)
@@ -79,17 +80,17 @@ class FrontEnd:
         for k, (track, pixel) in enumerate(zip(frame.points.tolist(), frame.pixels, strict=True)):
             self.tracks[track] = Track({0: pixel})
             if k in recognized:
-                rho = 1 / float(np.linalg.norm(self._world.points[track] - frame.pose[:3]))
-                noisy = rho * (1 + _TARGET_SHARE * np.random.default_rng([self._world.seed, track]).normal())
+                rho = 1 / float(np.linalg.norm(self.world.points[track] - frame.pose[:3]))
+                noisy = rho * (1 + _TARGET_SHARE * np.random.default_rng([self.world.seed, track]).normal())
                 self._feature(draft, 0, track, pixel, noisy, _TARGET_SHARE * rho)
 
     def _feature(self, draft: Draft, n: int, track: int, pixel: np.ndarray, rho: float, sigma_rho: float) -> None:
         key = symbol("f", track)
         draft.idp(key)
         draft.idp_first(
-            symbol("x", n), key, self._world.camera, pixel, rho, sigma_rho=sigma_rho, sigma_pixel=self._sigma
+            symbol("x", n), key, self.world.camera, pixel, rho, sigma_rho=sigma_rho, sigma_pixel=self._sigma
         )
-        self.tracks[track].first, self.tracks[track].sights = n, 1
+        self.tracks[track].first, self.tracks[track].observations = n, 1
 
     def _ahead(self, number: int) -> np.ndarray:
         """Where steady motion leads: the last step once more."""
@@ -99,16 +100,16 @@ class FrontEnd:
         before = pose_matrix(self._map.value(symbol("x", number - 2)))
         return pose_vector(last @ np.linalg.inv(before) @ last)
 
-    def _sights(self, draft: Draft, number: int, frame: Frame) -> None:
+    def _observations(self, draft: Draft, number: int, frame: Frame) -> None:
         for track, pixel in zip(frame.points.tolist(), frame.pixels, strict=True):
             known = self.tracks.setdefault(track, Track())
             known.pixels = {n: p for n, p in known.pixels.items() if n >= number - 2} | {number: pixel}
             sigmas = (self._sigma, self._sigma)
             if known.first >= 0:
                 draft.idp_seen(
-                    symbol("x", number), symbol("f", track), self._world.camera, pixel, sigmas=sigmas, loss=LOSS
+                    symbol("x", number), symbol("f", track), self.world.camera, pixel, sigmas=sigmas, loss=LOSS
                 )
-                known.sights += 1
+                known.observations += 1
             elif number > 2 and self._is_smooth(known, number):
                 self._feature(draft, number, track, pixel, _RHO, _SIGMA_RHO)
 
@@ -191,7 +192,7 @@ def report(rows: list[dict[str, Any]]) -> str:
         position, pose, depth = row["nees_position"], row["nees_pose"], row["inverse_depth"]
         lines += [
             f"  {row['map']}: {row['frames']} frames, {row['features']} features ({row['points']} points at the end), "
-            f"{row['sights']} sights, {row['inactive']} inactive, {row['seconds']:.0f} s",
+            f"{row['observations']} observations, {row['inactive']} inactive, {row['seconds']:.0f} s",
             f"    position {row['error_m']['rms'] * 1e3:.1f} mm RMS; NEES {position['mean']:.2f} of 3, "
             f"{position['within']:.1%} within 3σ; of the pose {pose['mean']:.2f} of 6, {pose['within']:.1%}",
             f"    inverse depths: NEES {depth['nees']:.2f} of 1, {depth['within']:.1%} of {row['features_judged']} "
@@ -210,13 +211,13 @@ def judged(front: FrontEnd, graph: Batch) -> dict[str, Any]:
     off, nees3, nees6 = (np.array(column) for column in zip(*poses, strict=True))
     errors = np.array([error for _, error in depths])
     shares = np.array([share for share, _ in depths])
-    sights = [t.sights for t in front.tracks.values() if t.first >= 0]
+    observations = [t.observations for t in front.tracks.values() if t.first >= 0]
     return {
         "frames": len(front.poses),
-        "features": len(sights),
+        "features": len(observations),
         "points": sum(len(group.keys) for group in graph.variables if group.kind == "point3"),
         "features_judged": len(depths),
-        "sights": sum(sights),
+        "observations": sum(observations),
         "inactive": len(solver.inactive()),
         "error_m": {"rms": float(np.sqrt(np.mean(off**2))), "end": float(off[-1])},
         "nees_position": {"mean": float(nees3.mean()), "wanted": 3.0, "within": float((nees3 < _WITHIN[3]).mean())},
@@ -229,7 +230,7 @@ def judged(front: FrontEnd, graph: Batch) -> dict[str, Any]:
 def _covariance(solver: Solver) -> tuple[np.ndarray, dict[int, int], dict[int, np.ndarray]]:
     """Λ⁻¹, dense; first scalars and values by key."""
     solver.step()
-    graph, blocks = solver._graph, solver._stepper.system.blocks
+    graph, blocks = graph_in(solver), system_in(solver).blocks
     n = int(graph.counts[at.SCALARS])
     offsets = np.concatenate([[0], np.cumsum(graph.dims[: graph.counts[at.COLUMNS]])])
     information = np.zeros((n, n))
@@ -271,11 +272,11 @@ def _depths(front: FrontEnd, covariance: np.ndarray, starts: dict[int, int], val
     """(σ_ρ/ρ, error in σ_ρ) of features that were seen often; of a point, ρ along the ray from its first camera."""
     found = []
     for track, seen in front.tracks.items():
-        if seen.first < 0 or seen.sights < _LASTING:
+        if seen.first < 0 or seen.observations < _LASTING:
             continue
         key = symbol("f", track)
         here, start = values[key], starts[key]
-        truth = 1 / float(np.linalg.norm(front._world.points[track] - front.poses[seen.first][:3]))
+        truth = 1 / float(np.linalg.norm(front.world.points[track] - front.poses[seen.first][:3]))
         if here.size == 6:
             rho, sigma = here[5], np.sqrt(covariance[start + 5, start + 5])
         else:

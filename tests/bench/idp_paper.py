@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 
 from factorbus import idp
 from factorbus.idp import classical, independent, minimal
@@ -33,22 +33,22 @@ def tables() -> dict[str, Any]:
 
 def counted(n: int, existing: int = 0) -> dict[str, int]:
     """Multiplications of the three for n new features and a number of existing ones."""
-    sighting, P = random_sighting(1, n, existing)
-    seen = idp.see(sighting)
-    A, B = idp.jacobians(sighting, seen)
-    padd = idp.padd(sighting)
+    observations, P = random_observations(1, n, existing)
+    seen = idp.see(observations)
+    A, B = idp.jacobians(observations, seen)
+    padd = idp.padd(observations)
     return {
         "classical": classical.covariance(P, A, B, padd).multiplications,
         "independent": independent.covariance(P, A, B, padd).multiplications,
-        "minimal": minimal.covariance(P, sighting, seen).multiplications,
-        "minimal-half": half_count(sighting, seen),
-        "factored": minimal.covariance_factors(sighting, seen).multiplications,
+        "minimal": minimal.covariance(P, observations, seen).multiplications,
+        "minimal-half": half_count(observations, seen),
+        "factored": minimal.covariance_factors(observations, seen).multiplications,
     }
 
 
-def half_count(sighting: Any, seen: Any) -> int:
+def half_count(observations: Any, seen: Any) -> int:
     """Multiplications of the upper half."""
-    parts = minimal.FeatureRows(sighting, seen)
+    parts = minimal.FeatureRows(observations, seen)
     return parts.multiplications + parts.half(0, len(seen.y)).multiplications
 
 
@@ -58,28 +58,28 @@ def _all_three(n: int) -> dict[str, int]:
 
 def _table_1() -> list[dict[str, Any]]:
     """Sizes of J, P and Jᵀ in iterations 1 to 3, and what multiplying them takes."""
-    sighting, P = random_sighting(1, 3)
-    A, B = idp.jacobians(sighting, idp.see(sighting))
+    observations, P = random_observations(1, 3)
+    A, B = idp.jacobians(observations, idp.see(observations))
     rows = []
     for k in range(3):
-        J, padded = classical.step_matrices(P, A[k], B[k], idp.padd(sighting))
-        P, count = classical.step(P, A[k], B[k], idp.padd(sighting))
+        J, padded = classical.step_matrices(P, A[k], B[k], idp.padd(observations))
+        P, count = classical.step(P, A[k], B[k], idp.padd(observations))
         rows.append({"iteration": k + 1, "J": J.shape, "P": padded.shape, "Jt": J.T.shape, "multiplications": count})
     return rows
 
 
 def _parts(n: int) -> dict[str, int]:
     """What the independent computation of n features multiplies, by part."""
-    sighting, P = random_sighting(1, n)
-    A, B = idp.jacobians(sighting, idp.see(sighting))
+    observations, P = random_observations(1, n)
+    A, B = idp.jacobians(observations, idp.see(observations))
     counts = np.zeros(kernels.COUNTS, np.int64)
-    independent.some_rows(0, n, P[:13].copy(), A, B, idp.padd(sighting), np.empty((13 + 6 * n, 13 + 6 * n)), counts)
+    independent.some_rows(0, n, P[:13].copy(), A, B, idp.padd(observations), np.empty((13 + 6 * n, 13 + 6 * n)), counts)
     names = ("left", "right", "own_left", "own", "blocks")
     return dict(zip(names, counts.tolist(), strict=True))
 
 
 def _table_2() -> list[list[str]]:
-    """The cells of the new covariance for three features: P, its borders, blocks, own parts on the diagonal."""
+    """The cells of the new covariance for three features: P, cross-covariances, blocks, own parts on the diagonal."""
     n = 3
     part = _parts(n)
     left, right, block = part["left"] // n, part["right"] // n, part["blocks"] // (n * n)

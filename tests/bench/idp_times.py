@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 from bench.idp_paper import half_count
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 
 from factorbus import idp
 from factorbus.idp import classical, independent, minimal
 from factorbus.idp.kernels.dense import counted_product
 from factorbus.proto.arrays import F64
-from factorbus.proto.features import FEATURE, Sighting
+from factorbus.proto.features import FEATURE, Observations
 
 _WHOLE = 100
 _LAST_STEP = 150  # the state's features at the step that stands for all of a longer run
@@ -31,7 +31,7 @@ class Case:
 
     features: int
     existing: int
-    sighting: Sighting
+    observations: Observations
     seen: idp.Seen
     P: F64
     A: F64
@@ -48,10 +48,12 @@ class Case:
 
 def case(features: int, existing: int = 0) -> Case:
     """A random one."""
-    sighting, P = random_sighting(1, features, existing)
-    seen = idp.see(sighting)
+    observations, P = random_observations(1, features, existing)
+    seen = idp.see(observations)
     out = np.full((len(P) + FEATURE * features,) * 2, 1.0)
-    return Case(features, existing, sighting, seen, P, *idp.jacobians(sighting, seen), idp.padd(sighting), out)
+    return Case(
+        features, existing, observations, seen, P, *idp.jacobians(observations, seen), idp.padd(observations), out
+    )
 
 
 def rows(features: int, existing: int = 0) -> list[dict[str, Any]]:
@@ -61,20 +63,23 @@ def rows(features: int, existing: int = 0) -> list[dict[str, Any]]:
         _classical(c, blas=False),
         _classical(c, blas=True),
         c.row("independent", lambda: independent.covariance(c.P, c.A, c.B, c.padd, c.out).multiplications),
-        c.row("minimal", lambda: minimal.covariance(c.P, c.sighting, c.seen, c.out).multiplications),
-        c.row("minimal-half", lambda: half_count(c.sighting, c.seen)),
-        c.row("factored", lambda: minimal.covariance_factors(c.sighting, c.seen).multiplications),
+        c.row("minimal", lambda: minimal.covariance(c.P, c.observations, c.seen, c.out).multiplications),
+        c.row("minimal-half", lambda: half_count(c.observations, c.seen)),
+        c.row("factored", lambda: minimal.covariance_factors(c.observations, c.seen).multiplications),
     ]
 
 
 def factored(features: int) -> list[dict[str, Any]]:
     """The factored form of many features: from y and slopes, as the other methods, and all the way from pixels."""
     c = case(0)
-    sighting, _ = random_sighting(1, features)
-    c = replace(c, features=features, sighting=sighting, seen=idp.see(sighting))
+    observations, _ = random_observations(1, features)
+    c = replace(c, features=features, observations=observations, seen=idp.see(observations))
     return [
-        c.row("factored", lambda: minimal.covariance_factors(sighting, c.seen).multiplications),
-        c.row("factored-from-pixels", lambda: minimal.covariance_factors(sighting, idp.see(sighting)).multiplications),
+        c.row("factored", lambda: minimal.covariance_factors(observations, c.seen).multiplications),
+        c.row(
+            "factored-from-pixels",
+            lambda: minimal.covariance_factors(observations, idp.see(observations)).multiplications,
+        ),
     ]
 
 

@@ -45,11 +45,11 @@ class Mutator:
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)
-        self._pool = golden()
+        self.pool = golden()
 
     def any_message(self) -> bytes:
         """A golden message, mutated."""
-        return self.mutated(self.random.choice(self._pool))
+        return self.mutated(self.random.choice(self.pool))
 
     def insert(self, sequence: int, batch: Batch) -> bytes:
         """An insert of `batch`, mutated in what it means or in its bytes; now and then not at all."""
@@ -81,7 +81,7 @@ def _insert_bytes(mutator: Mutator, data: bytes) -> bytes:
 
 
 def _splice(mutator: Mutator, data: bytes) -> bytes:
-    other = mutator.random.choice(mutator._pool)
+    other = mutator.random.choice(mutator.pool)
     return data[: mutator.random.randrange(len(data) + 1)] + other[mutator.random.randrange(len(other) + 1) :]
 
 

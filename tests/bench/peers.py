@@ -153,11 +153,11 @@ def _replays(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell
         for problem in plan.chosen:
             for name, each in runs[problem.key].items():
                 begin(f"{problem.key}: χ² of {name}", problem.steps)
-                each[0] = _looked_at(looked, problem, each[0], progress)
+                each[0] = looked_at(looked, problem, each[0], progress)
     return runs
 
 
-def _looked_at(settings: runner.Settings, problem: Problem, run: dict[str, Any], progress: Tell) -> dict[str, Any]:
+def looked_at(settings: runner.Settings, problem: Problem, run: dict[str, Any], progress: Tell) -> dict[str, Any]:
     """The run with χ² at all samples, up to where it came to."""
     if not run.get("done"):
         return run

@@ -14,7 +14,7 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 
 def test_rows_and_targets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ask, "_problem", lambda name, poses: SIMULATED[0].shortened(120))
+    monkeypatch.setattr(ask, "problem", lambda name, poses: SIMULATED[0].shortened(120))
     monkeypatch.setattr(ask, "_CANDIDATES", 200)
     found = ask.run(120)
     assert len(found["targets"]) == 5
@@ -31,12 +31,12 @@ def test_blocks_are_gtsam_s_at_the_end_of_a_data_set(datasets: Path, name: str) 
     """At the batch optimum, where both are linearized."""
     assert datasets.is_dir()
     graph = Solver(Options(mode="all-batch"))
-    problem: Problem = ask._problem(name, 0)
+    problem: Problem = ask.problem_named(name, 0)
     for batch in ask.load(problem):
         graph.stage(batch)
     graph.step(settle=True)
     assert solve_batch(*graph.graph()).chi2 == pytest.approx(graph.chi2(), rel=1e-9)
-    _, worst = ask._gtsam(graph, CovarianceBlocks(graph.covariances.factored()).diagonal(), _between)
+    _, worst = ask.time_gtsam(graph, CovarianceBlocks(graph.covariances.factored()).diagonal(), _between)
     assert worst < 1e-7
     assert np.isfinite(worst)
 

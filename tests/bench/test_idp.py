@@ -8,7 +8,7 @@ from bench import idp, idp_euroc, idp_paper, idp_times
 
 from factorbus.idp import minimal, see
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import Sighting
+from factorbus.proto.features import Observations
 
 
 def test_the_paper_s_tables_and_figures() -> None:
@@ -66,12 +66,12 @@ class Near:
         self.camera = camera
 
     def grow(self, x: np.ndarray, P: np.ndarray, pixels: np.ndarray):
-        from factorbus.client.filter_state import Grown
+        from factorbus.client.filter_state import FilterState
 
-        sighting = Sighting(self.camera, x[:13], P[:13], pixels, idp_euroc._RHO, idp_euroc._SIGMA_RHO, 2.5)
-        seen = see(sighting)
-        after = minimal.covariance(P, sighting, seen).P
-        return Grown(np.concatenate([x, seen.y.reshape(-1)]), after, seen.y, ("here",), 0.0)
+        observations = Observations(self.camera, x[:13], P[:13], pixels, idp_euroc._RHO, idp_euroc._SIGMA_RHO, 2.5)
+        seen = see(observations)
+        after = minimal.covariance(P, observations, seen).P
+        return FilterState(np.concatenate([x, seen.y.reshape(-1)]), after, seen.y, ("here",), 0.0)
 
 
 def test_real_tracks_with_their_outliers_give_the_trajectory(datasets: Path) -> None:

@@ -263,13 +263,13 @@ def test_a_pass_counts_only_against_openblas_and_with_the_same_solution() -> Non
 def test_time_inside_compiled_calls_is_part_of_the_step() -> None:
     steps = load(Problem("manhattan", "Manhattan", poses=150, seed=1))
     with overhead.timed_calls() as inside:
-        found = overhead._drive("auto", steps, inside)
+        found = overhead.drive("auto", steps, inside)
     for part in ("all", "odometry"):
         row = found[part]
         assert 0 < row["inside_us"] < row["total_us"]
         assert 0 < row["outside_us"] < row["total_us"]
     assert found["odometry"]["steps"] < found["all"]["steps"] == 150
-    assert not any(getattr(f, "__name__", "") == "call" for m in overhead._python_modules() for f in vars(m).values())
+    assert not any(getattr(f, "__name__", "") == "call" for m in overhead.python_modules() for f in vars(m).values())
 
 
 def test_the_solvers_own_account_of_compiled_time_is_preferred() -> None:
@@ -373,7 +373,7 @@ def test_a_run_whose_looks_crashed_has_no_quality_and_misses_its_bar(monkeypatch
 
     monkeypatch.setattr(runner, "run_quality", crash)
     world = Problem("intel", "intel")
-    run = peers._looked_at(runner.Settings(Path(), None), world, a_run("auto", chi2_settled=10.0), SILENT)
+    run = peers.looked_at(runner.Settings(Path(), None), world, a_run("auto", chi2_settled=10.0), SILENT)
     assert run["chi2"] == []
     assert "exit code -9" in run["reason"]
     assert judged(chi2=[])["at most median"] == MISSED

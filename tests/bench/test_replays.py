@@ -61,11 +61,11 @@ def test_chi2_is_that_of_g2o_also_far_from_the_optimum(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["poses", "landmarks", "space"])
 def test_chi2_is_nearly_that_of_gtsam(kind: str) -> None:
-    """GTSAM takes the logarithm of the error, and sightings as bearing and range: equal to first order only."""
+    """GTSAM takes the logarithm of the error, and observations as bearing and range: equal to first order only."""
     pytest.importorskip("gtsam")
     steps = REPLAYS[kind]
     contestant = run("isam2-0.01", steps)
-    own = 2 * contestant._isam.getFactorsUnsafe().error(contestant._estimate)  # type: ignore[attr-defined]
+    own = contestant.own_chi2()  # type: ignore[attr-defined]
     assert chi2.chi2_at(columns_of(steps), contestant.values(), len(steps) - 1) == pytest.approx(own, rel=5e-3)
 
 
@@ -90,8 +90,8 @@ def test_isam2_says_that_a_system_is_indeterminate() -> None:
     contestant = contestants.make("isam2-0.1")
     key = np.array([5])
     lonely = Variables("point2", np.array([7]), np.array([[1.0, 0.0]]))
-    sighting = Factors("bearing_range_se2", np.array([[5, 7]]), np.array([[0.0, 1.0]]), np.array([[1.0, 0.0, 1.0]]))
-    contestant.prepare(Batch((Variables("se2", key, np.zeros((1, 3))), lonely), (sighting,)))
+    observation = Factors("bearing_range_se2", np.array([[5, 7]]), np.array([[0.0, 1.0]]), np.array([[1.0, 0.0, 1.0]]))
+    contestant.prepare(Batch((Variables("se2", key, np.zeros((1, 3))), lonely), (observation,)))
     with pytest.raises(Failed, match="Indeterminate"):
         contestant.step()
 
@@ -105,8 +105,8 @@ def test_update_alone_comes_to_what_was_rehearsed_and_fails_where_that_failed() 
         np.testing.assert_array_equal(keys, with_estimates[kind][0])
         np.testing.assert_array_equal(numbers, with_estimates[kind][1])
     lonely = Variables("point2", np.array([7]), np.array([[1.0, 0.0]]))
-    sighting = Factors("bearing_range_se2", np.array([[5, 7]]), np.array([[0.0, 1.0]]), np.array([[1.0, 0.0, 1.0]]))
-    broken = [Batch((Variables("se2", np.array([5]), np.zeros((1, 3))), lonely), (sighting,))]
+    observation = Factors("bearing_range_se2", np.array([[5, 7]]), np.array([[0.0, 1.0]]), np.array([[1.0, 0.0, 1.0]]))
+    broken = [Batch((Variables("se2", np.array([5]), np.zeros((1, 3))), lonely), (observation,))]
     contestant = contestants.make("isam2-0.1-update")
     assert isinstance(contestant, contestants.Rehearsing)
     contestant.rehearse(broken, {0})

@@ -14,7 +14,7 @@ from factorbus.client import Bus, Changes, Draft, Map, Unavailable, aio, connect
 from factorbus.client.changes import some_of
 from factorbus.client.draft import batch_of
 from factorbus.client.merging import fit_into
-from factorbus.client.uncertainty import factors_of, paired, sightings, why_question
+from factorbus.client.uncertainty import association_question, factors_of, paired, why_question
 from factorbus.proto.asking import Covariances
 from factorbus.proto.messages import Accepted, Batch, Estimate, MapGraph
 from factorbus.proto.problems import BadLoss, BadOption, BadShape, ClosedHere, Problem
@@ -78,7 +78,10 @@ def kitchen(bus: Bus) -> Iterator[Map]:
             lambda: fit_into(Estimate(1, 1, ()), MapGraph(1, 1, Batch()), letters=ANY),
             "letters: 'no' (str); wanted a mapping of letters",
         ),
-        (lambda: sightings("x1", "landmark_se2", (1, 1), np.eye(2), None, ANY), "probability: 'no' (str); wanted"),
+        (
+            lambda: association_question("x1", "landmark_se2", (1, 1), np.eye(2), None, ANY),
+            "probability: 'no' (str); wanted",
+        ),
     ],
 )
 def test_without_a_bus(call: Callable[[], object], said: str) -> None:
@@ -102,9 +105,9 @@ def test_without_a_bus(call: Callable[[], object], said: str) -> None:
         (lambda: Draft().linear(["x0"], [("a", 0, 0)], [np.eye(3)], np.zeros(3), sigmas=[1] * 3), "bad_shape"),
         (lambda: Draft().variable(cast("Any", []), "x0"), "unknown_kind"),
         (lambda: Changes().weigh([1], math.nan), "not_finite"),
-        (lambda: sightings("x1", "landmark_se2", ANY, np.eye(2), None, 0.9), "bad_shape"),
-        (lambda: sightings("x1", "landmark_se2", (math.nan, 0), np.eye(2), None, 0.9), "not_finite"),
-        (lambda: sightings("x1", "landmark_se2", (1, 0), ANY, None, 0.9), "bad_shape"),
+        (lambda: association_question("x1", "landmark_se2", ANY, np.eye(2), None, 0.9), "bad_shape"),
+        (lambda: association_question("x1", "landmark_se2", (math.nan, 0), np.eye(2), None, 0.9), "not_finite"),
+        (lambda: association_question("x1", "landmark_se2", (1, 0), ANY, None, 0.9), "bad_shape"),
         (lambda: paired(cast("Any", 5)), "bad_shape"),
         (lambda: paired(cast("Any", [None])), "bad_shape"),
         (lambda: why_question(None, cast("Any", [])), "bad_shape"),

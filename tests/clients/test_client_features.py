@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 
 from factorbus import idp
-from factorbus.client.filter_state import factored, grown
+from factorbus.client.filter_state import augmented, factored
 from factorbus.client.shared_memory_pool import SharedMemoryPool
 from factorbus.idp import job, minimal
-from factorbus.proto.features import Ask, Done, FeaturesAnswer, Shard, ShardDone, Sighting
+from factorbus.proto.features import Ask, Done, FeaturesAnswer, Observations, Shard, ShardDone
 from factorbus.proto.features_codec import decode_answer, encode_answer, encode_ask, encode_shard
 from factorbus.proto.problems import BadMessage
 from factorbus.proto.segments import PAGE
@@ -21,10 +21,10 @@ N, CUTS = 150, ((0, 7), (7, 8), (8, 150))
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[Sighting, np.ndarray, np.ndarray]:
-    """(sighting, P before, P after)."""
-    sighting, P = random_sighting(41, N, 2)
-    return sighting, P, minimal.covariance(P, sighting, idp.see(sighting)).P
+def seen() -> tuple[Observations, np.ndarray, np.ndarray]:
+    """(observations, P before, P after)."""
+    observations, P = random_observations(41, N, 2)
+    return observations, P, minimal.covariance(P, observations, idp.see(observations)).P
 
 
 def answered(ask: Ask, cuts: tuple[tuple[int, int], ...] = CUTS) -> FeaturesAnswer:
@@ -36,36 +36,38 @@ def answered(ask: Ask, cuts: tuple[tuple[int, int], ...] = CUTS) -> FeaturesAnsw
 
 @pytest.mark.parametrize("form", ["rows", "half"])
 def test_shards_become_the_grown_covariance(seen, form: str) -> None:
-    sighting, P, after = seen
-    x = np.arange(float(sighting.width))
-    found = grown(x, P, sighting, answered(Ask(sighting, form)), None)
+    observations, P, after = seen
+    x = np.arange(float(observations.width))
+    found = augmented(x, P, observations, answered(Ask(observations, form)), None)
     assert found.P.tobytes() == after.tobytes()
     assert found.x[: x.size].tobytes() == x.tobytes()
-    assert found.x[x.size :].tobytes() == found.y.tobytes() == idp.see(sighting).y.tobytes()
+    assert found.x[x.size :].tobytes() == found.y.tobytes() == idp.see(observations).y.tobytes()
     assert (found.workers, found.seconds) == (("w0", "w7", "w8"), 0.5)
 
 
 def test_rows_in_memory_and_rows_that_came_as_bytes_are_put_together(seen) -> None:
     """One worker shares memory with us, another does not."""
-    sighting, P, after = seen
+    observations, P, after = seen
     pool = SharedMemoryPool()
-    m = sighting.width
+    m = observations.width
     allocation = pool.try_allocate(PAGE, after.shape, m)
     assert allocation is not None
-    here = answered(Ask(sighting, "rows", allocation.segment), CUTS[:2])
-    elsewhere = answered(Ask(sighting, "rows"), CUTS[2:])
+    here = answered(Ask(observations, "rows", allocation.segment), CUTS[:2])
+    elsewhere = answered(Ask(observations, "rows"), CUTS[2:])
     assert [done.shard.stored for done in here.shards] == [True, True]
-    found = grown(np.zeros(m), P, sighting, FeaturesAnswer((*here.shards, *elsewhere.shards), True), allocation.matrix)
+    found = augmented(
+        np.zeros(m), P, observations, FeaturesAnswer((*here.shards, *elsewhere.shards), True), allocation.matrix
+    )
     assert found.P.tobytes() == after.tobytes()
     pool.settle(allocation, clean=False)
     pool.close()
 
 
 def test_factors_give_every_block(seen) -> None:
-    sighting, _, after = seen
-    found = factored(sighting, answered(Ask(sighting, "factored")))
-    m = sighting.width
-    assert found.y.tobytes() == idp.see(sighting).y.tobytes()
+    observations, _, after = seen
+    found = factored(observations, answered(Ask(observations, "factored")))
+    m = observations.width
+    assert found.y.tobytes() == idp.see(observations).y.tobytes()
     scale = abs(after).max()
     for i, k in ((0, 0), (3, 140), (140, 3), (149, 149)):
         wanted = after[m + 6 * i : m + 6 * i + 6, m + 6 * k : m + 6 * k + 6]
@@ -74,10 +76,10 @@ def test_factors_give_every_block(seen) -> None:
 
 
 def test_no_pixels_leave_everything_as_it_was(seen) -> None:
-    sighting, P, _ = seen
-    none = Sighting(sighting.camera, sighting.state, sighting.covariance, np.empty((0, 2)))
-    x = np.arange(float(sighting.width))
-    found = grown(x, P, none, answered(Ask(none, "half"), ((0, 0),)), None)
+    observations, P, _ = seen
+    none = Observations(observations.camera, observations.state, observations.covariance, np.empty((0, 2)))
+    x = np.arange(float(observations.width))
+    found = augmented(x, P, none, answered(Ask(none, "half"), ((0, 0),)), None)
     assert (found.x.tobytes(), found.P.tobytes(), found.y.shape) == (x.tobytes(), P.tobytes(), (0, 6))
 
 
@@ -109,9 +111,11 @@ def other(**fields: object) -> Callable[[Done], Done]:
     ],
 )
 def test_an_answer_that_cannot_be_is_no_covariance(seen, form: str, change: Callable[[Done], Done | None]) -> None:
-    sighting, P, _ = seen
+    observations, P, _ = seen
     with pytest.raises(BadMessage):
-        grown(np.zeros(sighting.width), P, sighting, broken(change)(answered(Ask(sighting, form))), None)
+        augmented(
+            np.zeros(observations.width), P, observations, broken(change)(answered(Ask(observations, form))), None
+        )
 
 
 def descriptors() -> set[str]:

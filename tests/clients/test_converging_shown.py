@@ -38,7 +38,7 @@ def service(tmp_path: Path) -> Iterator[Service]:
 
 def said(service: Service, folder: Path, how: dict[str, Any], capsys: pytest.CaptureFixture[str], *command: str) -> str:
     service.says = _SERVICE | _ROW | how
-    service.says["maps"] = [service._row() | {"clients": 0}]
+    service.says["maps"] = [service.row() | {"clients": 0}]
     assert main([*command, "--connect", endpoint_in(folder)]) == OK
     return " ".join(capsys.readouterr().out.split())
 
@@ -89,7 +89,7 @@ def test_stats_of_one_map(service: Service, tmp_path: Path, capsys: Any) -> None
 
 def test_stats_of_one_map_leave_out_the_others(service: Service, tmp_path: Path, capsys: Any) -> None:
     service.says = _SERVICE | _ROW | CONVERGED
-    rows = [service._row() | {"clients": 0}, service._row() | {"clients": 0, "name": "attic"}]
+    rows = [service.row() | {"clients": 0}, service.row() | {"clients": 0, "name": "attic"}]
     service.says["maps"] = rows
     service.says["unopened"] = [{"name": "cellar", "state": "damaged", "problem": "a page"}]
     assert main(["stats", "attic", "--json", "--connect", endpoint_in(tmp_path)]) == OK

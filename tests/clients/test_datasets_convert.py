@@ -164,11 +164,11 @@ def test_the_catalogue_counts_right(datasets: Path, dataset: Dataset) -> None:
     content = (datasets / dataset.file).read_bytes()
     rows = [line.split()[:3] for line in content.decode().splitlines()]
     edges = [row for row in rows if row[0] in ("EDGE_SE2", "EDGE_SE3:QUAT")]
-    sightings = [row for row in rows if row[0] == "EDGE_SE2_XY"]
+    observations = [row for row in rows if row[0] == "EDGE_SE2_XY"]
     poses = {word for row in edges for word in row[1:]}
     assert sha256(content) == dataset.sha256
-    assert (len(edges), len(sightings)) == (dataset.edges, dataset.sightings)
-    assert (len(poses), len({row[2] for row in sightings})) == (dataset.poses, dataset.landmarks)
+    assert (len(edges), len(observations)) == (dataset.edges, dataset.observations)
+    assert (len(poses), len({row[2] for row in observations})) == (dataset.poses, dataset.landmarks)
     assert sum(row[0].startswith("VERTEX") for row in rows) == dataset.vertices
     assert any("SE3" in row[0] for row in rows) == (dataset.kind == "3D")
 

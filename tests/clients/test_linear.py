@@ -218,7 +218,7 @@ def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
     assert len(find_joints(graph_in(other))) == count - 1
     for key, row in values(other).items():
         assert np.abs(row - values(solver)[key]).max() < 1e-7  # the last is known to half a metre
-    # A marginal of one state has the next one in its border, and nothing else.
+    # A marginal of one state has the next one in its separator, and nothing else.
     slid, *_ = with_changes(solver, [Change("marginalize", keys=np.array([symbol(c, 0) for c in "xvag"]))], settle=True)
     widths = sorted(len(joint.variables) for joint in find_joints(graph_in(slid)))
     assert widths == [4] + [8] * (count - 2)

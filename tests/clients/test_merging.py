@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_factors import boxminus, boxplus, pose_matrix, pose_vector, residual
 from naive.dense_least_squares import full
+from naive.random_camera_factors import random_camera_factor
 from naive.random_graphs import random_information, random_value
 from naive.random_others import random_other
-from naive.random_sights import random_sight
 
 from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, KeyCollision, NoAnchor
 from factorbus.client.frames import compose, difference, inverse, moved_values
@@ -49,7 +49,7 @@ def test_composition_is_that_of_matrices(kind: str, seed: int) -> None:
 def random_relative(kind: str, rng: np.random.Generator) -> Any:
     """Values of what a factor of this kind is on, and what is measured."""
     if kind in ("idp_first", "idp_seen", "point_seen"):
-        return random_sight(kind, rng)[1:]
+        return random_camera_factor(kind, rng)[1:]
     ends = [random_value(of, rng) for of in FACTOR_KINDS[kind].connects]
     if kind.startswith("between"):
         return ends, random_value(FACTOR_KINDS[kind].connects[0], rng)

@@ -27,7 +27,7 @@ def shown(width: int, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setenv("TERM", "dumb")
     console = Console(width=width, highlight=False, color_system=None)
     with console.capture() as captured:
-        console.print(top._view(SEEN, "tcp/127.0.0.1:7447", console))
+        console.print(top.view(SEEN, "tcp/127.0.0.1:7447", console))
     return captured.get()
 
 
@@ -57,7 +57,7 @@ def test_a_title_is_as_wide_as_it_is(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_fields_of_a_journal_are_rounded_and_empty_ones_left_away() -> None:
     fields = {"durability": "commit", "commits": 31, "commit_ms": 332.3176280064217, "longest_commit_ms": 12345.6}
-    told = dict(stats._told(fields | {"problem": "", "seconds": 0.0123456}))
+    told = dict(stats.shown(fields | {"problem": "", "seconds": 0.0123456}))
     assert told == {
         "durability": "commit",
         "commits": "31",

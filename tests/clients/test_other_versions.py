@@ -87,8 +87,8 @@ class Older(Service):
         self.protocol = protocol
         super().__init__(folder)
 
-    def _row(self) -> dict:
-        return super()._row() | {"protocol": self.protocol}
+    def row(self) -> dict:
+        return super().row() | {"protocol": self.protocol}
 
 
 @pytest.mark.parametrize(

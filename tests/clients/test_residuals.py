@@ -57,7 +57,7 @@ def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(steps
     assert total == pytest.approx(report.chi2, rel=1e-9)
 
 
-def test_the_graphs_above_have_every_kind_but_sights() -> None:
+def test_the_graphs_above_have_every_kind_but_observations() -> None:
     kinds = {group.kind for steps, seed in WORLDS for step in steps(seed) for group in step.factors}
     lenses = {"idp_first", "idp_seen", "point_seen", "point_seen_mount"}  # more than colours need
     assert kinds == set(FACTOR_KINDS) - lenses

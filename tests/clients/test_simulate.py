@@ -168,8 +168,8 @@ def test_loops_of_manhattan_are_what_was_asked_for() -> None:
 def test_densities_are_those_of_the_data_sets() -> None:
     factors = sum(step.batch.factor_count for step in manhattan())
     assert 5000 < factors < 6500  # manhattan3500: 5598
-    sightings = sum(len(group.keys) for step in city_trees() for group in step.batch.factors[1:])
-    assert 4000 < sightings < 8000  # citytrees10000: 4443
+    observations = sum(len(group.keys) for step in city_trees() for group in step.batch.factors[1:])
+    assert 4000 < observations < 8000  # citytrees10000: 4443
     assert sum(step.batch.factor_count for step in sphere()) == 4949  # as sphere2500
 
 

@@ -4,13 +4,13 @@ from itertools import islice, pairwise
 
 import numpy as np
 import pytest
-from naive.random_sightings import CAMERAS
+from naive.random_cameras import CAMERAS
 
 from factorbus.cli.demo.evaluate_filter import FilterEvaluator, verdict
-from factorbus.client.filter_state import Grown
+from factorbus.client.filter_state import FilterState
 from factorbus.idp import lenses, minimal, see
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import Sighting
+from factorbus.proto.features import Observations
 from factorbus.simulate import BadParameter, MonocularWorld, monocular
 from factorbus.simulate.lens import seen_by
 
@@ -75,11 +75,11 @@ class Near:
     def __init__(self, camera: Camera, **prior: float) -> None:
         self.camera, self._prior = camera, prior
 
-    def grow(self, x: np.ndarray, P: np.ndarray, pixels: np.ndarray) -> Grown:
-        sighting = Sighting(self.camera, x[:13], P[:13], pixels, **self._prior)
-        seen = see(sighting)
-        after = minimal.covariance(P, sighting, seen).P
-        return Grown(np.concatenate([x, seen.y.reshape(-1)]), after, seen.y, ("here",), 0.0)
+    def grow(self, x: np.ndarray, P: np.ndarray, pixels: np.ndarray) -> FilterState:
+        observations = Observations(self.camera, x[:13], P[:13], pixels, **self._prior)
+        seen = see(observations)
+        after = minimal.covariance(P, observations, seen).P
+        return FilterState(np.concatenate([x, seen.y.reshape(-1)]), after, seen.y, ("here",), 0.0)
 
 
 @pytest.mark.parametrize("camera", ["radial", "radtan"])

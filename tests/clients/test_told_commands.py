@@ -63,6 +63,7 @@ def parse(words: list[str]) -> None:
     context = click.Context(cli)
     while isinstance(command, click.Group):
         with command.make_context(command.name, words, parent=context) as context:
+            # What click has of a group's command, and gives to nobody but itself.
             rest = [*context._protected_args, *context.args]
             if not rest:
                 return

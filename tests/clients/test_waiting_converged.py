@@ -87,7 +87,7 @@ def test_a_fresh_mirror_knows_what_the_service_does(service: Service, tmp_path: 
 def test_a_mirror_that_is_told_of_another_revision_asks(service: Service, tmp_path: Path) -> None:
     """The map went on between the answer that let it in and the estimate: nothing that it was told is of this one."""
     service.says = CONVERGING
-    asked = service._ask
+    asked = service.answered
 
     def step_first(question: str, payload: bytes) -> bytes | None:
         if question == "estimate" and service.revision == 0:
@@ -96,7 +96,7 @@ def test_a_mirror_that_is_told_of_another_revision_asks(service: Service, tmp_pa
             service.mute = False
         return asked(question, payload)
 
-    service._ask = step_first
+    service.answered = step_first
     with connect(endpoint_in(tmp_path)) as bus, bus.map(MAP) as joined:
         joined.wait_converged(50)
         assert (joined.estimate.revision, joined.estimate.converged) == (1, True)

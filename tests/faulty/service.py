@@ -88,7 +88,7 @@ class Service:
                 elif "/ask/" in key:
                     if key != keys.ask_key(MAP, key.rpartition("/")[2]):
                         raise UnknownMap(key.split("/")[3])
-                    answer = self._ask(key.rpartition("/")[2], payload)
+                    answer = self.answered(key.rpartition("/")[2], payload)
                 else:
                     answer = self._admin(key.rpartition("/")[2])
                 if answer is not None:
@@ -131,12 +131,12 @@ class Service:
         self.step({int(k): tuple(v) for g in groups for k, v in zip(g.keys, g.values, strict=True)})
         return codec.encode_accepted(Accepted(insert.sequence, self.epoch, self.revision, 0, 1, {}))
 
-    def _ask(self, question: str, payload: bytes) -> bytes | None:
+    def answered(self, question: str, payload: bytes) -> bytes | None:
         self.asked.append(question)
         if self.ask_fault == "silence":
             return None
         if question == "stats":
-            return codec.encode_map(self._row())
+            return codec.encode_map(self.row())
         if self.before_estimate is not None:
             first, self.before_estimate = self.before_estimate, None
             first()
@@ -145,10 +145,10 @@ class Service:
         return codec.encode_estimate(Estimate(self.epoch, self.revision, self._columns(chosen)))
 
     def _admin(self, operation: str) -> bytes:
-        row = self._row()
+        row = self.row()
         return codec.encode_map({"maps": [row]} if operation == "maps" else row)
 
-    def _row(self) -> dict[str, Any]:
+    def row(self) -> dict[str, Any]:
         row = {"name": MAP, "mode": "auto", "epoch": self.epoch, "revision": self.revision}
         return row | {"variables": len(self.values), "factors": 0} | self.says
 

@@ -189,7 +189,7 @@ class Quiet(Service):
         super().__init__(folder, endpoint=endpoint)
         self._other = self._session.liveliness().declare_token("factorbus/v2/features/s/live")
 
-    def _ask(self, question: str, payload: bytes) -> bytes | None:
+    def answered(self, question: str, payload: bytes) -> bytes | None:
         self.asked.append(question)
         if len(self.asked) <= 5:
             return None

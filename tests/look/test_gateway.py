@@ -225,7 +225,7 @@ def test_the_page_in_a_browser(endpoint: str, gateway: str, tmp_path: Path) -> N
             assert (before != after).any(axis=2).mean() > 0.005
             assert share_of(after, style.ESTIMATE) > 3e-4
             assert share_of(after, style.POINTS) > 5e-5
-            assert share_of(after, style.DOUBT) > 5e-5
+            assert share_of(after, style.UNCERTAINTY) > 5e-5
             x, y = page.evaluate("window.factorbus.pixelOf('x40')")
             box = page.locator("#map").bounding_box()
             page.mouse.click(box["x"] + x, box["y"] + y)

@@ -160,6 +160,6 @@ def test_a_piece_of_negative_weight_is_explained() -> None:
         "weight": 1.0,
         "rho": -4.0,
     }
-    account = {"key": 7, "kind": "se2", "value": [0.0] * 3, "fixed": False, "sigmas": [1.0] * 3, "conditioning": 1.0,
+    explained = {"key": 7, "kind": "se2", "value": [0.0] * 3, "fixed": False, "sigmas": [1.0] * 3, "conditioning": 1.0,
                "factors": [factor], "pivot": 1.0, "linearized_step": 1, "changed_step": 1, "seen_step": 1}  # fmt: skip
-    assert explain(Why(1, 1, account, {}, {}))["factors"][0]["misfit"] == 0.0
+    assert explain(Why(1, 1, explained, {}, {}))["factors"][0]["misfit"] == 0.0

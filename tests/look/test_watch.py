@@ -105,7 +105,7 @@ def test_a_browser_shows_the_served_view(endpoint: str, spawn: Callable[..., Pro
 
 
 def is_drawn(picture: np.ndarray) -> bool:
-    return share_of(picture, style.ESTIMATE) >= 5e-4 and share_of(picture, style.DOUBT) >= 1e-4
+    return share_of(picture, style.ESTIMATE) >= 5e-4 and share_of(picture, style.UNCERTAINTY) >= 1e-4
 
 
 def test_rays_point_where_the_features_angles_say_and_end_at_the_horizon() -> None:

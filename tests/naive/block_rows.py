@@ -1,6 +1,7 @@
 """R in block rows, and Λ and η in blocks, as whole matrices."""
 
 import numpy as np
+from naive.solver_parts import graph_in, system_in
 from scipy.sparse import coo_array
 
 from factorbus.solver.kernels.inc_l import block_rows as br
@@ -36,7 +37,7 @@ def dense_r(rows, sparse: bool = False):
 
 def dense_lambda(solver, sparse: bool = False):
     """(Λ, η) as the solver holds them, in insertion order."""
-    graph, blocks = solver._graph, solver._stepper.system.blocks
+    graph, blocks = graph_in(solver), system_in(solver).blocks
     dims = graph.dims[: graph.counts[at.COLUMNS]]
     starts = np.concatenate([[0], np.cumsum(dims)])
     entries, rows, cols = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]

@@ -41,10 +41,10 @@ def check_candidates(gate: Any, gated: Any, gained: Any, known: DenseCovariance,
 
 
 def check_pairs(seen: Any, found: Any, known: DenseCovariance, rel: float) -> None:
-    """d² of every pair of sighting and landmark that is told."""
+    """d² of every pair of observation and landmark that is told."""
     assert len(found.distances)
-    for sighting, landmark, told in zip(found.sightings, found.candidates, found.distances, strict=True):
-        ends, z, upper = [seen.pose, int(landmark)], seen.measured[sighting], seen.information[sighting]
+    for observation, landmark, told in zip(found.observations, found.candidates, found.distances, strict=True):
+        ends, z, upper = [seen.pose, int(landmark)], seen.measured[observation], seen.information[observation]
         r, spread, noise = known.innovation(seen.kind, ends, z, upper)
         np.testing.assert_allclose(told, r @ np.linalg.solve(spread + noise, r), rtol=rel)
 

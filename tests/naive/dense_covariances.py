@@ -38,9 +38,9 @@ class DenseCovariance:
 
 
 def best_association(S: np.ndarray, r: np.ndarray, pairs: list[tuple[int, int]], dim: int, gates: np.ndarray):
-    """(d², pairs) of the largest jointly compatible set of (sighting, landmark) pairs, the nearest of those."""
+    """(d², pairs) of the largest jointly compatible set of (observation, landmark) pairs, the nearest of those."""
     best: tuple[int, float, tuple[int, ...]] = (0, 0.0, ())
-    for count in range(1, len({sighting for sighting, _ in pairs}) + 1):
+    for count in range(1, len({observation for observation, _ in pairs}) + 1):
         for some in itertools.combinations(range(len(pairs)), count):
             if len({pairs[q][0] for q in some}) < count or len({pairs[q][1] for q in some}) < count:
                 continue

@@ -52,7 +52,7 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     if kind.endswith("_mount"):
         return residual(kind.removesuffix("_mount"), sensors(ends), z)
     if kind in ("idp_first", "idp_seen", "point_seen"):
-        return _sight(kind, *ends, z)
+        return _observation(kind, *ends, z)
     if kind.startswith("linear"):
         return _linear(kind, ends, z)
     if kind.startswith(("position", "heading", "attitude")):
@@ -141,7 +141,7 @@ def camera_of(lens: np.ndarray) -> Camera:
     return Camera(*(("radtan", (fu, fv, cx, cy, *more)) if code == 1 else ("fisheye", (fu, fv, cx, cy, *more[:4]))))
 
 
-def _sight(kind: str, pose: np.ndarray, end: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _observation(kind: str, pose: np.ndarray, end: np.ndarray, z: np.ndarray) -> np.ndarray:
     camera = camera_of(z[3 if kind == "idp_first" else 2 :])
     state = np.concatenate([pose[:3], pose[[6, 3, 4, 5]], np.zeros(6)])
     if kind == "point_seen":

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from naive.dense_factors import TANGENT, _pose_error, boxplus, pose_matrix
 from naive.dense_least_squares import DenseGraph, distance
+from naive.solver_parts import graph_in
 
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
@@ -82,7 +83,7 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 def covariance(solver: Solver, *names: int) -> np.ndarray:
     return CovarianceBlocks(solver.covariances.factored()).joint(
-        np.array([solver._graph.find(key) for key in x(*names).tolist()])
+        np.array([graph_in(solver).find(key) for key in x(*names).tolist()])
     )
 
 
@@ -154,8 +155,8 @@ def twin_of(batch: Batch, estimate: dict[int, tuple[str, np.ndarray]], gone: np.
     touched = {key for (_, keys, _, _), of in zip(whole.factors, taken, strict=True) if of for key in keys}
     whole.factors = [factor for factor, of in zip(whole.factors, taken, strict=True) if of]
     whole.losses = [loss for loss, of in zip(whole.losses, taken, strict=True) if of]
-    border = sorted(touched - leaving)
-    whole.kinds = {key: whole.kinds[key] for key in [*sorted(leaving), *border]}
+    separator = sorted(touched - leaving)
+    whole.kinds = {key: whole.kinds[key] for key in [*sorted(leaving), *separator]}
     Lambda, eta = whole.system()
     cut = sum(TANGENT[whole.kinds[key]] for key in leaving)
     gain = np.linalg.solve(Lambda[:cut, :cut], np.column_stack([Lambda[:cut, cut:], eta[:cut]]))
@@ -163,4 +164,6 @@ def twin_of(batch: Batch, estimate: dict[int, tuple[str, np.ndarray]], gone: np.
     lam, V = np.linalg.eigh(S)
     known = lam > 1e-12 * lam[-1]
     R = np.sqrt(lam[known])[:, None] * V[:, known].T
-    return Twin(left, border, [left.values[key] for key in border], R, (V[:, known].T @ right) / np.sqrt(lam[known]))
+    return Twin(
+        left, separator, [left.values[key] for key in separator], R, (V[:, known].T @ right) / np.sqrt(lam[known])
+    )

@@ -1,8 +1,8 @@
 """Inserts with numbers from everywhere in what a map admits: the smallest, the largest, and the same place twice."""
 
 import numpy as np
-from naive.random_sightings import CAMERAS
-from naive.random_sights import SIGHTS, measurement
+from naive.random_camera_factors import CAMERA_KINDS, measurement
+from naive.random_cameras import CAMERAS
 
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -62,7 +62,7 @@ def information(dim: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def measured(kind: str, rng: np.random.Generator) -> np.ndarray:
-    if kind in SIGHTS:
+    if kind in CAMERA_KINDS:
         z = measurement(kind, CAMERAS["radtan"], np.zeros(2), number(rng) if kind == "idp_first" else 0.0)
         z[:2] = rng.uniform(0, 500, 2) if rng.random() < 0.7 else numbers(2, rng)
         return z
@@ -88,7 +88,7 @@ def connects(kind: str) -> list[str]:
         return [kind.rpartition("_")[2]]
     if kind.startswith(("between", "range_between")):
         return [kind.rpartition("_")[2]] * 2
-    if kind in SIGHTS:
+    if kind in CAMERA_KINDS:
         return ["se3", "point3" if kind == "point_seen" else "idp"]
     return [kind.rpartition("_")[2], "point2" if kind.endswith("se2") else "point3"]
 

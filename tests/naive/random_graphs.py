@@ -6,8 +6,8 @@ import numpy as np
 from naive.dense_factors import TANGENT, boxplus, pose_matrix, pose_vector, residual
 from naive.dense_idp import feature, point
 from naive.dense_least_squares import CONNECTS
-from naive.random_sightings import CAMERAS
-from naive.random_sights import SIGHTS, measurement, state_of
+from naive.random_camera_factors import CAMERA_KINDS, measurement, state_of
+from naive.random_cameras import CAMERAS
 
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -61,7 +61,7 @@ def factor(kind: str, keys: list[int], truth: dict[int, np.ndarray], noise: floa
     z = measured(kind, [truth[key] for key in keys], noise, rng)
     dim = FACTOR_KINDS[kind].dim
     information = random_information(dim, rng)
-    if kind in SIGHTS:
+    if kind in CAMERA_KINDS:
         unit = np.array([1, 1, 1, _PIXEL, _PIXEL, 1])[:dim] if dim == 6 else np.full(2, _PIXEL)
         information *= np.outer(unit, unit)[np.triu_indices(dim)]
     return Factors(kind, np.array([keys]), z[None], information[None])

@@ -1,6 +1,7 @@
 """R in block rows, and Λ in blocks, as sparse matrices, made without a loop: fast enough to look after every step."""
 
 import numpy as np
+from naive.solver_parts import graph_in, system_in
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
@@ -39,7 +40,7 @@ def sparse_r(rows) -> tuple[csr_array, I64, F64]:
 
 def sparse_lambda(solver) -> tuple[csr_array, F64]:
     """(Λ, η) as the solver holds them, in insertion order."""
-    graph, blocks = solver._graph, solver._stepper.system.blocks
+    graph, blocks = graph_in(solver), system_in(solver).blocks
     dims = graph.dims[: graph.counts[at.COLUMNS]]
     starts = np.concatenate(([0], np.cumsum(dims)))
     rows, cols, offsets = blocks.rows, blocks.cols, blocks.offsets

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from naive.solver_parts import graph_in, stepper_in, tree_of
 
 from factorbus.solver import Solver
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
 
@@ -23,21 +23,16 @@ class Clique:
     children: list[int]
 
 
-def tree_of(solver: Solver) -> CliqueTree:
-    """The tree of a solver in the mode "bayes-tree"."""
-    assert isinstance(solver._stepper, TreeSteps)
-    return solver._stepper.tree
-
-
 def stays_at_linearization(solver: Solver) -> bool:
     """Whether its estimate was left where the tree is linearized: R waits for the next step to be used."""
-    assert isinstance(solver._stepper, TreeSteps)
-    return solver._stepper._at_linearization
+    stepper = stepper_in(solver)
+    assert isinstance(stepper, TreeSteps)
+    return stepper._at_linearization  # no step tells: the next one does as much work either way
 
 
 def cliques(solver: Solver) -> dict[int, Clique]:
     """The cliques that hold the free variables."""
-    tree, var = tree_of(solver), solver._graph.var
+    tree, var = tree_of(solver), graph_in(solver).var
     free = [v for v in range(solver.variable_count) if var[v, at.V_COLUMN] >= 0]
     found = {}
     for c in sorted({int(tree.node[v, tl.N_CLIQUE]) for v in free}):
@@ -54,7 +49,7 @@ def cliques(solver: Solver) -> dict[int, Clique]:
 
 def assert_is_a_tree(solver: Solver) -> dict[int, Clique]:
     """Every free variable is a frontal once, every separator lies in its parent, every factor has one owner."""
-    tree, graph = tree_of(solver), solver._graph
+    tree, graph = tree_of(solver), graph_in(solver)
     found = cliques(solver)
     frontals = sorted(v for clique in found.values() for v in clique.frontals)
     assert frontals == [v for v in range(solver.variable_count) if graph.var[v, at.V_COLUMN] >= 0]
@@ -80,7 +75,7 @@ def assert_is_a_tree(solver: Solver) -> dict[int, Clique]:
 
 def assert_factors_have_owners(solver: Solver) -> None:
     """Each factor on a free variable is in the list of one of its variables."""
-    tree, graph = tree_of(solver), solver._graph
+    tree, graph = tree_of(solver), graph_in(solver)
     owned = []
     for v in range(solver.variable_count):
         f = int(tree.node[v, tl.N_OWN])

@@ -4,6 +4,7 @@ import copy
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
 from naive.tree_records import assert_is_a_tree, tree_of
 
 from factorbus.solver import Solver
@@ -34,7 +35,7 @@ def assert_is_solution(
 
 def normal_equations(solver: Solver) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Λ, η and χ² of all factors at the linearization points, by the kernels of the other modes; and δ."""
-    graph = copy.copy(solver._graph)
+    graph = copy.copy(graph_in(solver))
     graph.fac, graph.values = graph.fac.copy(), tree_of(solver).lin[0].copy()
     blocks, scalars = HessianBlocks(), int(graph.counts[at.SCALARS])
     chi2 = blocks.extend(graph, (0,) * at.COUNTS)

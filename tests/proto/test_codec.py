@@ -298,7 +298,7 @@ def test_no_bytes_do_harm(decoder: str, data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [*sorted(set(GOLDEN) & set(DECODERS)), "insert_all_kinds", "insert_sights", "insert_points"]
+    "name", [*sorted(set(GOLDEN) & set(DECODERS)), "insert_all_kinds", "insert_observations", "insert_points"]
 )
 @settings(max_examples=150)
 @given(data=st.data())

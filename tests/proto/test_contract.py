@@ -114,7 +114,7 @@ def test_settings_of_the_session_are_those_of_the_client() -> None:
     """§14 names the keys of Zenoh's configuration, with the values that the Python client has."""
     table = CONTRACT.split("by the keys of its configuration:")[1].split("## 15")[0]
     told = {key: json.loads(value) for key, value in re.findall(r"^\| `([a-z_/]+)` \| `([^`]+)` \|", table, re.M)}
-    ours = link._settings(["tcp/127.0.0.1:1"])
+    ours = link.session_settings(["tcp/127.0.0.1:1"])
     assert set(told) == set(ours) - {
         "connect/endpoints", "scouting/multicast/enabled", "scouting/gossip/enabled",
     }  # fmt: skip

@@ -17,7 +17,7 @@ from naive import dense_idp
 from factorbus.proto import codec
 from factorbus.proto import features_codec as features
 from factorbus.proto.camera import MODELS, BadCamera, Camera
-from factorbus.proto.features import FORMS, Ask, Done, FeaturesAnswer, Segment, Shard, ShardDone, Sighting
+from factorbus.proto.features import FORMS, Ask, Done, FeaturesAnswer, Observations, Segment, Shard, ShardDone
 from factorbus.proto.problems import BadMessage, Problem, TooLarge
 
 VECTORS = Path(__file__).parents[2] / "proto" / "vectors" / "features"
@@ -73,7 +73,7 @@ def same(made: Any, golden: Any, field: str = "") -> None:
 
 def test_the_answer_answers_the_question() -> None:
     """Against the twin with matrices: y of each pixel, and its covariance with the filter's state and by itself."""
-    seen, answer = features.decode_ask(GOLDEN["ask"]).sighting, features.decode_answer(GOLDEN["answer"])
+    seen, answer = features.decode_ask(GOLDEN["ask"]).observations, features.decode_answer(GOLDEN["answer"])
     (done,) = answer.shards
     shard, m = done.shard, seen.width
     state, rows = np.asarray(seen.state), np.asarray(shard.rows)
@@ -137,10 +137,12 @@ def asks(draw: st.DrawFn) -> Ask:
     size = draw(st.sampled_from([(0, 0), (640, 480)]))
     camera = Camera(model, tuple(draw(NUMBER) for _ in MODELS[model]), *size)
     m, n = draw(st.integers(13, 30)), draw(st.integers(0, 5))
-    sighting = Sighting(camera, draw(block(13)), draw(block(13, m)), draw(block(n, 2)), *(draw(NUMBER) for _ in "123"))
+    observations = Observations(
+        camera, draw(block(13)), draw(block(13, m)), draw(block(n, 2)), *(draw(NUMBER) for _ in "123")
+    )
     size_ = st.integers(0, 2**62)
     segment = st.builds(Segment, size_, size_, st.text(max_size=9), size_, size_)
-    return Ask(sighting, draw(st.sampled_from(FORMS)), draw(st.none() | segment))
+    return Ask(observations, draw(st.sampled_from(FORMS)), draw(st.none() | segment))
 
 
 @st.composite
@@ -156,12 +158,12 @@ def shards_done(draw: st.DrawFn) -> ShardDone:
 @given(asks())
 def test_an_ask_survives(ask: Ask) -> None:
     came = features.decode_ask(features.encode_ask(ask))
-    assert (came.form, came.segment, came.sighting.camera) == (ask.form, ask.segment, ask.sighting.camera)
+    assert (came.form, came.segment, came.observations.camera) == (ask.form, ask.segment, ask.observations.camera)
     for name in ("state", "covariance", "pixels"):
-        sent, got = getattr(ask.sighting, name), getattr(came.sighting, name)
+        sent, got = getattr(ask.observations, name), getattr(came.observations, name)
         assert (sent.shape, sent.tobytes()) == (got.shape, got.tobytes())
     for name in ("rho", "sigma_rho", "sigma_pixel"):
-        assert getattr(ask.sighting, name) == getattr(came.sighting, name)
+        assert getattr(ask.observations, name) == getattr(came.observations, name)
 
 
 @given(shards_done())
@@ -205,7 +207,7 @@ def test_a_field_of_another_type_or_length_is_refused(ask: Ask, name: str, data:
 def test_every_field_is_explained() -> None:
     names = {*Ask._fields, *Segment._fields, *Shard._fields, *ShardDone._fields, *FeaturesAnswer._fields, *Done._fields}
     names |= {"camera", "state", "covariance", "pixels", "rho", "sigma_rho", "sigma_pixel", "model", "numbers", *FORMS}
-    names -= {"sighting"}
+    names -= {"observations"}
     assert not {name for name in names if f"`{name}`" not in CONTRACT}
     assert not {name for name in MODELS if f"`{name}`" not in CONTRACT}
     for code in ("bad_camera", "bad_pixel", "bad_state"):

@@ -179,7 +179,7 @@ def test_pairs_are_the_largest_set_that_is_compatible(known: DenseCovariance) ->
     parts = [known.innovation(seen.kind, [seen.pose, key], seen.measured[s], seen.information[s]) for s, key in pairs]
     gates = [chi2_distribution.ppf(seen.probability, 2 * count) if count else 0.0 for count in range(3)]
     near = [n for n, (r, spread, noise) in enumerate(parts) if r @ np.linalg.solve(spread + noise, r) <= gates[1]]
-    assert [(int(s), int(key)) for s, key in zip(found.sightings, found.candidates, strict=True)] == [
+    assert [(int(s), int(key)) for s, key in zip(found.observations, found.candidates, strict=True)] == [
         pairs[n] for n in near
     ]
     (only,) = near  # of several their innovations would be correlated

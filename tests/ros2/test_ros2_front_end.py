@@ -211,8 +211,8 @@ def test_a_pose_is_carried_to_its_keyframe_with_its_covariance() -> None:
 
 
 @given(seeds)
-def test_sightings_have_the_covariance_of_their_derivatives(seed: int) -> None:
-    """The mount, the way since the keyframe and the sighting, each off by a little, one after the other."""
+def test_observations_have_the_covariance_of_their_derivatives(seed: int) -> None:
+    """The mount, the way since the keyframe and the observation, each off by a little, one after the other."""
     random = np.random.default_rng(seed)
     mount, p = random_transform(random), random.normal(size=3) * 3
     speeds = (random.uniform(0.1, 1, 6) ** 2).tolist()
@@ -234,8 +234,10 @@ def test_sightings_have_the_covariance_of_their_derivatives(seed: int) -> None:
     assert_allclose(factor.measured[0], place(np.zeros(6), np.zeros(3)), atol=1e-9)
     h = 1e-6
     by_way = np.column_stack([(place(h * e, np.zeros(3)) - place(-h * e, np.zeros(3))) / (2 * h) for e in np.eye(6)])
-    by_sight = np.column_stack([(place(np.zeros(6), h * e) - place(np.zeros(6), -h * e)) / (2 * h) for e in np.eye(3)])
-    wanted = by_way @ np.diag(speeds) @ by_way.T + 0.09 * by_sight @ by_sight.T
+    by_observation = np.column_stack(
+        [(place(np.zeros(6), h * e) - place(np.zeros(6), -h * e)) / (2 * h) for e in np.eye(3)]
+    )
+    wanted = by_way @ np.diag(speeds) @ by_way.T + 0.09 * by_observation @ by_observation.T
     assert_allclose(covariance_of(factor, 3), wanted, rtol=1e-4, atol=1e-5)
 
 

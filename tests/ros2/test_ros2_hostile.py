@@ -257,14 +257,14 @@ def test_a_bridge_says_once_what_it_did_and_survives_a_fault_of_its_own(
 ) -> None:
     node, joined, stop = Listening(), FakeMap(), threading.Event()
     bridge = Bridge(joined, node, MESSAGES, Settings(space="space", display_s=60.0))  # type: ignore[arg-type]
-    detections = bridge._front_end.detections
+    detections = FrontEnd.detections
 
-    def fails(topic: str, message: Any) -> Draft | None:
+    def fails(front_end: FrontEnd, topic: str, message: Any) -> Draft | None:
         if message.header.frame_id == "fault":
             raise ZeroDivisionError("as if")
-        return detections(topic, message)
+        return detections(front_end, topic, message)
 
-    monkeypatch.setattr(bridge._front_end, "detections", fails)
+    monkeypatch.setattr(FrontEnd, "detections", fails)
     running = threading.Thread(target=bridge.run, args=(stop,))
     with caplog.at_level(logging.WARNING, "factorbus.ros2"):
         running.start()

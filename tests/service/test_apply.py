@@ -344,8 +344,10 @@ def test_the_size_of_a_map_is_kept_either_way() -> None:
     assert [code for result in applied for code in codes(result)] == ["accepted", "accepted", "too_large"]
 
 
-def test_messages_that_are_larger_than_usual_are_written_too(map_solver: MapSolver) -> None:
-    map_solver._messages._out = map_solver._messages._out[:100]
+def test_messages_that_are_larger_than_usual_are_written_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("factorbus.service.solving.messages.ROOM", 100)
+    map_solver = MapSolver(make, EPOCH, Limits())
+    assert codes(apply(map_solver, located(start()))) == ["accepted"]
     for n in range(1, 6):
         applied, in_one_piece = apply_single(map_solver, located(pose(f"x{n}", f"x{n - 1}")))
         assert in_one_piece

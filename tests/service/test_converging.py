@@ -56,7 +56,7 @@ class Driven:
         self.cpu_s += took_s
         self.revision += 1
         self.chi2 = of_step.pop("chi2", self.chi2 / 2)
-        effects = self.core.judged(Verdict(tuple(Outcome(i, b"ok") for i in run.inserts))) if run.inserts else []
+        effects = self.core.give_verdict(Verdict(tuple(Outcome(i, b"ok") for i in run.inserts))) if run.inserts else []
         of_step = {"changed": 3, **of_step}
         effects += self.core.stepped(
             Stepped(self.revision, b"", "tree", self.chi2, 1.0, converged=converged, further=run.further, **of_step)

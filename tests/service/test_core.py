@@ -45,7 +45,7 @@ def events(effects: list[Effect]) -> list[str]:
 
 
 def solved(core: MapCore, run: InsertBatch, answer: Any = b"ok") -> list[Effect]:
-    effects = core.judged(Verdict(tuple(Outcome(i, answer) for i in run.inserts)))
+    effects = core.give_verdict(Verdict(tuple(Outcome(i, answer) for i in run.inserts)))
     if run.inserts and isinstance(answer, bytes):
         effects += core.stepped(Stepped(core.revision + 1, b"delta", "all-batch", 1.5, 2.0))
     return effects + core.applied(Applied(3, 4, 0.5, 2.0))
@@ -67,7 +67,7 @@ def brought(core: MapCore, sequence: int, at: float, size: int = 10, settle: boo
 
 
 def finish(core: MapCore, run: InsertBatch, at: float) -> list[Effect]:
-    core.judged(Verdict(tuple(Outcome(i, b"ok") for i in run.inserts)))
+    core.give_verdict(Verdict(tuple(Outcome(i, b"ok") for i in run.inserts)))
     return core.applied(Applied(3, 4, 0.5, at))
 
 

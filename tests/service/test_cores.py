@@ -60,7 +60,7 @@ def test_no_more_than_told_and_than_there_are(
     assert list(iter_compile(tree_step))
     free, worker_threads = count_free(), WorkerThreads(told, 0)
     worker_threads.tick(lambda: 0)
-    assert worker_threads.account() == {"used": used, "pieces": 0}
+    assert worker_threads.counts() == {"used": used, "pieces": 0}
     assert worker_count() == used - 1
     assert count_free() == free - (used - 1)
     worker_threads.close()
@@ -73,13 +73,13 @@ def test_no_thread_compiles_what_nobody_has_asked_for_yet(monkeypatch: pytest.Mo
     monkeypatch.setattr(cores, "can_work", lambda: False)
     free, worker_threads = count_free(), WorkerThreads(2, 0)
     worker_threads.tick(lambda: 0)
-    assert worker_threads.account() == {"used": 1, "pieces": 0}
+    assert worker_threads.counts() == {"used": 1, "pieces": 0}
     assert (worker_count(), count_free()) == (0, free)
     assert list(iter_compile(tree_step))
     monkeypatch.setattr(cores, "can_work", can_work)
     for _ in range(2):
         worker_threads.tick(lambda: 0)
-        assert worker_threads.account() == {"used": 2, "pieces": 0}
+        assert worker_threads.counts() == {"used": 2, "pieces": 0}
         assert worker_count() == 1
     worker_threads.close()
     assert (worker_count(), count_free()) == (0, free)
@@ -91,6 +91,6 @@ def test_no_core_is_lent_to_small_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     worker_threads = WorkerThreads(2, 1000)
     for size, used in ((0, 1), (999, 1), (1000, 2), (0, 2)):
         worker_threads.tick(lambda size=size: size)
-        assert worker_threads.account()["used"] == used
+        assert worker_threads.counts()["used"] == used
         assert worker_count() == used - 1
     worker_threads.close()

@@ -29,14 +29,14 @@ TABLE = {
 
 @pytest.mark.parametrize("name", TABLE)
 def test_counts_and_order(datasets: Path, name: str) -> None:
-    poses, landmarks, edges, sightings, vertices = TABLE[name]
+    poses, landmarks, edges, observations, vertices = TABLE[name]
     graph = read(datasets / f"{name}.g2o")
     steps = list(graph.steps())
     assert sum(step.factor_count for step in steps) == graph.batch.factor_count
     counts = {group.kind: len(group.keys) for group in graph.batch.factors}
     between = "between_se3" if name in ("sphere2500", "parking_garage") else "between_se2"
     assert (graph.poses, graph.landmarks) == (poses, landmarks)
-    assert (counts[between], counts.get("landmark_se2", 0)) == (edges, sightings)
+    assert (counts[between], counts.get("landmark_se2", 0)) == (edges, observations)
     assert sum(len(group.keys) for group in graph.batch.variables if group.values is not None) == vertices
 
     assert len(steps) == poses

@@ -56,9 +56,9 @@ def test_g2o_in_the_plane(tmp_path: Path) -> None:
     np.testing.assert_array_equal(edge.keys, [x(0, 3)])
     np.testing.assert_array_equal(edge.measured, [[1, 0, 0.1]])
     np.testing.assert_array_equal(edge.information, [[1, 0, 0, 2, 0, 3]])
-    sight = factors(graph, "landmark_se2")
-    np.testing.assert_array_equal(sight.keys, [[x(3)[0], points(7)[0]]])
-    np.testing.assert_array_equal(sight.information, [[1, 0.5, 2]])
+    observation = factors(graph, "landmark_se2")
+    np.testing.assert_array_equal(observation.keys, [[x(3)[0], points(7)[0]]])
+    np.testing.assert_array_equal(observation.information, [[1, 0.5, 2]])
     np.testing.assert_array_equal(factors(graph, "prior_se2").keys, [x(3)])
     assert [lines.tolist() for lines in graph.factor_lines] == [[8], [6], [7]]
 

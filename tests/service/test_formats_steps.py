@@ -18,7 +18,7 @@ def edge(i: int, j: int, x: float = 1.0) -> str:
     return f"EDGE_SE2 {i} {j} {x} 0 0 {INFO3}\n"
 
 
-def sight(i: int, l: int) -> str:
+def observation(i: int, l: int) -> str:
     return f"EDGE_SE2_XY {i} {l} 1 2 1 0 1\n"
 
 
@@ -44,7 +44,16 @@ def story(steps: Steps) -> list[tuple[list[str], list[str]]]:
 
 
 def test_a_step_is_a_pose_with_its_odometry_first(tmp_path: Path) -> None:
-    text = edge(0, 1) + edge(2, 0) + edge(1, 2) + edge(2, 3) + sight(3, 9) + edge(1, 3) + edge(2, 3, 5) + sight(1, 9)
+    text = (
+        edge(0, 1)
+        + edge(2, 0)
+        + edge(1, 2)
+        + edge(2, 3)
+        + observation(3, 9)
+        + edge(1, 3)
+        + edge(2, 3, 5)
+        + observation(1, 9)
+    )
     assert story(graph_of(tmp_path, text).steps()) == [
         (["x0!="], []),
         (["x1", "l9"], ["x0-x1", "x1-l9"]),
@@ -84,7 +93,7 @@ def test_a_prior_takes_the_place_of_the_first_pose(tmp_path: Path) -> None:
 
 
 def test_a_pose_waits_for_the_one_that_joins_it(tmp_path: Path) -> None:
-    text = edge(1, 2) + sight(1, 8) + edge(2, 3) + edge(0, 3) + edge(3, 4)
+    text = edge(1, 2) + observation(1, 8) + edge(2, 3) + edge(0, 3) + edge(3, 4)
     assert story(graph_of(tmp_path, text).steps()) == [
         (["x0!="], []),
         (["x1", "x2", "x3", "l8"], ["x1-x2", "x2-x3", "x0-x3", "x1-l8"]),
@@ -93,7 +102,7 @@ def test_a_pose_waits_for_the_one_that_joins_it(tmp_path: Path) -> None:
 
 
 def test_a_pose_joined_by_points_alone_takes_its_value(tmp_path: Path) -> None:
-    text = edge(0, 1) + sight(0, 8) + sight(2, 8) + edge(2, 3)
+    text = edge(0, 1) + observation(0, 8) + observation(2, 8) + edge(2, 3)
     with pytest.raises(
         FormatError, match=r"x2 is joined to the rest only through points; wanted .* a vertex line for x2"
     ):
@@ -107,7 +116,7 @@ def test_a_pose_joined_by_points_alone_takes_its_value(tmp_path: Path) -> None:
 
 
 def test_localization_among_fixed_points(tmp_path: Path) -> None:
-    text = "VERTEX_SE2 0 1 1 1\nVERTEX_XY 8 1 2\nFIX 8\n" + sight(0, 8) + edge(0, 1) + sight(1, 8)
+    text = "VERTEX_SE2 0 1 1 1\nVERTEX_XY 8 1 2\nFIX 8\n" + observation(0, 8) + edge(0, 1) + observation(1, 8)
     assert story(graph_of(tmp_path, text).steps()) == [
         (["x0=", "l8!="], ["x0-l8"]),
         (["x1"], ["x0-x1", "x1-l8"]),
@@ -115,7 +124,7 @@ def test_localization_among_fixed_points(tmp_path: Path) -> None:
 
 
 def test_parts_are_named(tmp_path: Path) -> None:
-    text = edge(0, 1) + edge(1, 2) + edge(5, 6) + sight(6, 9) + "VERTEX_XY 11 0 0\n"
+    text = edge(0, 1) + edge(1, 2) + edge(5, 6) + observation(6, 9) + "VERTEX_XY 11 0 0\n"
     with pytest.raises(FormatError, match=r"2 parts .*: x0 .. x2 \(3 variables\); x5 .. l9 \(3 variables\); wanted"):
         graph_of(tmp_path, text).steps()
     fixed = "VERTEX_SE2 5 9 9 9\nFIX 0\nFIX 5\n" + edge(0, 1) + edge(5, 6)
@@ -142,7 +151,7 @@ def test_steps_are_a_sequence(tmp_path: Path) -> None:
 
 
 def test_whole_is_all_steps_at_once(tmp_path: Path) -> None:
-    graph = graph_of(tmp_path, "VERTEX_SE2 1 7 7 7\n" + edge(0, 1) + edge(1, 2) + sight(2, 9))
+    graph = graph_of(tmp_path, "VERTEX_SE2 1 7 7 7\n" + edge(0, 1) + edge(1, 2) + observation(2, 9))
     assert told(graph.whole()) == (["x0!=", "x1=", "x2", "l9"], ["x0-x1", "x1-x2", "x2-l9"])
 
 
@@ -155,7 +164,7 @@ def drives(draw: st.DrawFn) -> tuple[list[str], int]:
         lines.append(edge(j - 1, j) if draw(st.booleans()) else edge(j, j - 1))
         loops = draw(st.lists(st.integers(0, j - 1), max_size=3))
         lines += [edge(i, j, 2.0) if draw(st.booleans()) else edge(j, i, 2.0) for i in loops]
-        lines += [sight(j, 100 + point) for point in draw(st.lists(st.integers(0, 3), max_size=2))]
+        lines += [observation(j, 100 + point) for point in draw(st.lists(st.integers(0, 3), max_size=2))]
     return lines, poses
 
 

@@ -123,10 +123,10 @@ def small() -> Batch:
         np.array([[1, 0.5, 0.1]]),
         np.array([[1, 0, 0, 1, 0, 1.0]]),
     )
-    sight = Factors(
+    observation = Factors(
         "landmark_se2", np.array([[symbol("x", 1), symbol("l", 7)]]), np.array([[2, -0.0]]), np.array([[1, 0, 1.0]])
     )
-    return Batch((poses, point), (edge, sight))
+    return Batch((poses, point), (edge, observation))
 
 
 def test_text_of_g2o() -> None:
@@ -186,18 +186,18 @@ def test_kinds_without_a_record_are_left_out_and_said(tmp_path: Path, kind: str)
 
 def test_losses_and_antennas_beside_the_pose_are_left_out_and_said() -> None:
     batch = small()
-    edge, sight = batch.factors
+    edge, observation = batch.factors
     robust = edge._replace(loss="huber", scale=np.array([1.0]))
     antenna = Factors("position_se2", edge.keys[:, :1], np.array([[1, 2, 0.5, 0]]), np.array([[1, 0, 1.0]]))
-    written = as_g2o(Batch(batch.variables, (robust, sight, antenna)))
+    written = as_g2o(Batch(batch.variables, (robust, observation, antenna)))
     assert written.text == g2o_text(batch)
     assert written.left_out == {"between_se2 loss": 1, "position_se2": 1}
     assert written.notes[0] == "1 between_se2 loss left out: g2o has no losses: written without their huber"
     keys, measured = np.repeat(edge.keys, 2, 0), np.repeat(edge.measured, 2, 0)
     twice = Factors(edge.kind, keys, measured, np.repeat(edge.information, 2, 0), "huber", np.ones(2))
-    assert as_g2o(Batch(batch.variables, (twice, sight))).notes[0].startswith("2 between_se2 losses left out: ")
+    assert as_g2o(Batch(batch.variables, (twice, observation))).notes[0].startswith("2 between_se2 losses left out: ")
     with pytest.raises(FormatError, match="1 between_se2 loss"):
-        g2o_text(Batch(batch.variables, (robust, sight)), strict=True)
+        g2o_text(Batch(batch.variables, (robust, observation)), strict=True)
 
 
 def test_what_is_left_out_of_several_groups_is_said_once_for_the_file() -> None:

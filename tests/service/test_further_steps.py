@@ -1,18 +1,19 @@
 """A map that is left alone before it is at its optimum: further steps of a real solver, told, kept and made again."""
 
+import sqlite3
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from naive.solver_parts import graph_in
+from naive.solver_parts import graph_in, has_nothing_new, stepper_in
 from turned import closing, optimum
 from unconverged import DEGREES, EPOCH, FEW, POSES, arrived, inserts
 
 from factorbus.client import Draft
 from factorbus.journal.checkpoints import read_checkpoint, write_checkpoint
 from factorbus.journal.problems import JournalDiffers
-from factorbus.journal.store import Store, create, open_store
+from factorbus.journal.store import NAME, Store, create, open_store
 from factorbus.proto import codec
 from factorbus.proto.messages import Delta
 from factorbus.service.config import Limits
@@ -24,7 +25,9 @@ from factorbus.service.solving.apply import GOES_ON, MapSolver
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
 from factorbus.solver.errors import NotFinite
+from factorbus.solver.inc_l.steps import IncrementalSteps
 from factorbus.solver.kernels.model.bounds import MOST_NUMBER
+from factorbus.solver.stepper import Stepper
 
 MODES = ["inc-l", "all-batch"]
 ALL_MODES = [*MODES, "inc-l-b10", "bayes-tree"]
@@ -173,8 +176,10 @@ def test_an_insert_that_is_missing_is_not_taken_for_a_further_step(tmp_path: Pat
     for one in inserts():
         map_.apply(one)
     map_.apply(further=True)
-    map_.store._db.execute(damage)
     map_.store.close()
+    database = sqlite3.connect(tmp_path / "m" / NAME, isolation_level=None)
+    database.execute(damage)
+    database.close()
     store = open_store(tmp_path / "m")
     with pytest.raises(JournalDiffers, match="led to revision"):
         recover(store, folder_in("inc-l"))
@@ -209,7 +214,7 @@ def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pyte
     tried: list[Solver] = []
 
     def refuse(solver: Solver, settle: bool = False) -> Any:
-        if solver._stepper._goes_on:
+        if has_nothing_new(solver):
             tried.append(solver)
             raise NotFinite("χ²")
         return true_step(solver, settle)
@@ -227,17 +232,21 @@ def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pyte
 
 def escaping(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every further step leaves a value beyond what can be kept."""
-    true_step = Solver.step
+    true_step, true_changed, escaped = Solver.step, IncrementalSteps.changed, set[Stepper]()
 
     def step(solver: Solver, settle: bool = False) -> Any:
-        goes_on = solver._stepper._goes_on
+        further = has_nothing_new(solver)
         report = true_step(solver, settle)
-        if goes_on:
+        if further:
             graph_in(solver).values[0] = 2 * MOST_NUMBER
-            solver._stepper._changed = np.arange(solver.variable_count)
+            escaped.add(stepper_in(solver))
         return report
 
+    def changed(stepper: IncrementalSteps) -> np.ndarray:
+        return np.arange(stepper.mark[0]) if stepper in escaped else true_changed(stepper)
+
     monkeypatch.setattr(Solver, "step", step)
+    monkeypatch.setattr(IncrementalSteps, "changed", changed)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 1e-9], ids=["usual numbers", "unusual ones"])

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -114,9 +114,8 @@ class Setup:
             pass
 
     def until_short(self) -> None:
-        """A map that has made steps, none of them slow of late (whatever this machine does meanwhile)."""
+        """A map that has made a step, so that the next ones are short."""
         self.insert(start())
-        self.host.core._slowest_s = 0.0
 
 
 def start() -> Batch:
@@ -131,6 +130,12 @@ def pose(n: int) -> Batch:
 
 def keys(*names: str) -> np.ndarray:
     return np.array([parse_symbol(name) for name in names], np.int64)
+
+
+@pytest.fixture(autouse=True)
+def no_step_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever this machine does meanwhile."""
+    monkeypatch.setattr("factorbus.service.core.map_state.SHORT_S", 1e9)
 
 
 @pytest.fixture
@@ -148,9 +153,7 @@ def test_a_short_run_is_done_by_who_brought_it_and_others_by_the_maps_thread(set
     setup.until_short()
     setup.insert(pose(1))
     setup.insert(pose(2), settle=True)
-    setup.host.core._slowest_s = 0.0
     setup.insert(pose(3), size=1 << 20)
-    setup.host.core._slowest_s = 0.0
     setup.insert(pose(4))
     here = threading.current_thread().name
     assert setup.told.threads() == ["solver m", here, "solver m", "solver m", here]
@@ -196,13 +199,12 @@ def located(setup: Setup, content: Batch, asker: str = "") -> Arrived:
 
 
 def test_an_insert_read_where_it_lies_leaves_the_map_as_any_other(setup: Setup) -> None:
-    other = Setup()
+    other, sent = Setup(), dict[int, Batch]()
     for n in range(1, 30):
-        for one in (setup, other):
-            one.host.core._slowest_s = 0.0
         batch = start() if n == 1 else pose(n - 1)
         if n % 9 == 0:
             batch = pose(1)  # refused
+        sent[n] = batch
         setup.host.insert(located(setup, batch))
         message = codec.encode_insert(Insert(n, batch))
         arrived = other.arrived(batch, size=len(message))
@@ -215,16 +217,21 @@ def test_an_insert_read_where_it_lies_leaves_the_map_as_any_other(setup: Setup) 
         (a.sequence, a.revision, a.first_factor) for a in usual
     ]
     assert [type(effect) for effect in said(setup)] == [type(effect) for effect in said(other)]
-    counted = [plain(one.host.core.account(0.0)) for one in (setup, other)]
+    counted = [plain(one.host.core.operator_stats(0.0)) for one in (setup, other)]
     sizes = [row.pop("bytes") for row in counted]
     assert counted[0] == counted[1]
     assert sizes[0]["received"] == sizes[1]["received"]
     assert sizes[0]["answered"] == sum(len(a.message) for a in setup.told.answers())
-    clients = [one.host.core._admission._clients["a"] for one in (setup, other)]
-    assert (clients[0].next, clients[0].open) == (clients[1].next, clients[1].open) == (30, {})
-    assert {n: digest for n, (digest, _) in clients[0].answered.items()} == {
-        n: digest for n, (digest, _) in clients[1].answered.items()
-    }
+    assert [one.host.core.stats(0.0)["clients"] for one in (setup, other)] == [{"a": 30}] * 2
+    for one in (setup, other):
+        for n, batch in sent.items():  # asked again: the answer it had; with another content it is refused
+            message = codec.encode_insert(Insert(n, batch))
+            again = one.arrived(batch, size=len(message))._replace(sequence=n, digest=message_digest(message))
+            before = said(one)
+            one.host.insert(again)
+            assert [content(effect) for effect in said(one)[len(before) :]] == [content(before[n - 1])]
+            one.host.insert(again._replace(digest=message_digest(message + b" ")))
+            assert content(said(one)[-1]) == "bad_sequence"
     other.host.stop()
     other.told.wait_for(other.told.has(Drained))
     other.host.end()
@@ -235,16 +242,20 @@ def said(setup: Setup) -> list[Effect]:
     return [effect for effect, _ in setup.told.effects if isinstance(effect, Answer | Refuse)]
 
 
-def plain(account: dict[str, Any]) -> dict[str, Any]:
+def content(effect: Effect) -> bytes | str:
+    """What an answer says, whoever asked."""
+    return effect.problem.code if isinstance(effect, Refuse) else cast(Answer, effect).message
+
+
+def plain(stats: dict[str, Any]) -> dict[str, Any]:
     """Without times."""
-    return {name: value for name, value in account.items() if not name.endswith(("_s", "_ms"))}
+    return {name: value for name, value in stats.items() if not name.endswith(("_s", "_ms"))}
 
 
 def test_who_asks_again_while_it_is_folded_in_gets_the_same_answer(setup: Setup) -> None:
     setup.until_short()
     for n in (1, 2):
         setup.insert(pose(n))
-        setup.host.core._slowest_s = 0.0
     setup.solver.leave.clear()
     setup.solver.begun = threading.Semaphore(0)
     first = located(setup, pose(3))
@@ -284,10 +295,10 @@ def test_stopping_during_a_short_run_answers_it_first(setup: Setup) -> None:
 def test_a_fault_in_a_short_run_ends_the_map_and_tells_who_waits(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     setup.until_short()
 
-    def broken(inserts: Any, further: bool) -> Any:
+    def broken(map_solver: MapSolver, inserts: Any, further: bool) -> Any:
         raise RuntimeError("applying failed")
 
-    monkeypatch.setattr(setup.host._map_solver, "apply_batch", broken)
+    monkeypatch.setattr(MapSolver, "apply_batch", broken)
     setup.host.insert(setup.arrived(pose(1)))
     setup.host.insert(setup.arrived(pose(2)))
     codes = [effect.problem.code for effect, _ in setup.told.effects if isinstance(effect, Refuse)]

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 
 from factorbus.idp import job as idp_job
 from factorbus.proto import codec
@@ -22,7 +22,7 @@ FORMS = ("rows", "half", "factored")
 
 
 def features_job(form: str) -> Job:
-    ask = encode_ask(Ask(random_sighting(3, N, 2)[0], form))
+    ask = encode_ask(Ask(random_observations(3, N, 2)[0], form))
     return Job("j", "idp", encode_shard(Shard(ask, FIRST, LAST)))
 
 

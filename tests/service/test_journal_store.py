@@ -311,7 +311,7 @@ def test_one_owner_until_it_ends_however_it_ends(tmp_path: Path) -> None:
         taken.release()
 
 
-def test_the_chain_follows_values_and_time_stamps_and_not_accounts() -> None:
+def test_the_chain_follows_values_and_time_stamps_and_not_reports() -> None:
     from factorbus.proto import codec
     from factorbus.proto.messages import Delta, Variables
 

@@ -24,8 +24,8 @@ from factorbus.solver import Options, Solver
 POINT = symbol("l", 0)
 MODES = ("bayes-tree", "inc-l", "all-batch")
 # What an insert within its bounds may be refused for.
-REASONS = {"accepted", "diverged", "not_finite", "underconstrained", "uninitialized", "out_of_bounds", "bad_sight",
-           "bad_direction", "not_positive_definite", "bad_range"}  # fmt: skip
+REASONS = {"accepted", "diverged", "not_finite", "underconstrained", "uninitialized", "out_of_bounds",
+           "bad_observation", "bad_direction", "not_positive_definite", "bad_range"}  # fmt: skip
 
 
 class Map:

@@ -1,6 +1,7 @@
 """A journal that another build of the solver wrote: opened from its checkpoint, and what differs is said."""
 
 import json
+import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -252,18 +253,22 @@ def test_a_checkpoint_in_another_format_is_not_read_and_all_is_folded_again(
 
 
 def test_a_long_replay_is_made_once(
-    values: dict[int, bytes], library: Library, reopen: Callable[[], Session], tmp_path: Path
+    values: dict[int, bytes], tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """It counts as steps do: the state is written when the service stops, if nothing came, or soon after an insert."""
     changed(tmp_path / "m", f"UPDATE checkpoint SET format = {FORMAT + 1}")
-    library._config = Config(journal=str(tmp_path), checkpoint_s=1e-6)
-    session = reopen()
+    often_folder = tmp_path_factory.mktemp("often")
+    shutil.copytree(tmp_path / "m", often_folder / "m")
+    often = open_library(Config(journal=str(often_folder), checkpoint_s=1e-6), lambda _: None, None)
+    assert often is not None
+    session = Session(often.open("m", Limits()))
     assert session.recovered.from_record == 0
     assert session.keeper.wants_checkpoint()
     session.close(checkpoint=True)
-    session = reopen()
+    session = Session(often.open("m", Limits()))
     assert (session.recovered.from_record, session.recovered.records) == (INSERTS, 0)
     session.close()
+    often.close()
 
 
 @pytest.mark.parametrize("processor", ["", "elsewhere"])

@@ -15,7 +15,7 @@ from factorbus.proto.limits import REQUEST_LIMITS, MessageLimits
 from factorbus.proto.messages import Batch, Factors, Insert, Variables
 from factorbus.proto.problems import Problem, TooLarge
 from factorbus.service.core.events import Arrived, ParsedInsert
-from factorbus.service.kernels.words import LONGEST
+from factorbus.service.kernels.wire_tokens import LONGEST
 from factorbus.service.solving.arrival import message_digest, read_insert, try_parse
 from factorbus.solver.graph.columns import ints_at
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
@@ -321,8 +321,8 @@ def test_the_digest_of_a_message_never_changes() -> None:
     assert [message_digest(message) for message in (b"", b"factorbus", bytes(range(256)))] == wanted
 
 
-@pytest.mark.parametrize("name", ["insert_sights", "insert_points", "insert_losses"])
-def test_sights_losses_and_conversion_are_read_where_they_lie(name: str) -> None:
+@pytest.mark.parametrize("name", ["insert_observations", "insert_points", "insert_losses"])
+def test_observations_losses_and_conversion_are_read_where_they_lie(name: str) -> None:
     path = VECTORS / f"{name}.msgpack"
     assert path.exists()
     assert check_agrees(path.read_bytes())

@@ -98,7 +98,7 @@ class Service:
                 yield effect
                 continue
             outcomes = tuple(Outcome(insert, self._answer(insert)) for insert in effect.inserts)
-            yield from self._run(self.core.judged(Verdict(outcomes, 1, len(outcomes))))
+            yield from self._run(self.core.give_verdict(Verdict(outcomes, 1, len(outcomes))))
             yield from self._run(self.core.applied(Applied(0, 0, 0.0, self.now)))
 
     def _answer(self, insert: Arrived) -> bytes | Exception:

@@ -110,7 +110,7 @@ def test_what_the_solver_refuses_leaves_no_trace(seed: int) -> None:
     quick, usual = Solver(), Solver()
     for batch in earlier:
         stage_both(quick, usual, batch)
-    held = quick._graph.mark()
+    held = graph_in(quick).mark()
     codes = set()
     for bad in damaged(last, np.random.default_rng(seed)):
         codes.add(stage_both(quick, usual, bad))

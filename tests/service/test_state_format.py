@@ -48,7 +48,7 @@ def present() -> dict[str, Any]:
 def state_in(mode: str) -> dict[str, Any]:
     """Of a map that has all that a state can have: kinds in plane and space, stamps, named factors."""
     folder = make_map_solver(mode, {}, 1, Limits())
-    solver = folder._solver
+    solver = folder.solver
     for batch in random_steps(1, steps=20):
         solver.stage(batch)
         solver.step()

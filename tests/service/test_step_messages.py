@@ -26,17 +26,17 @@ def test_answers_and_delta_are_the_bytes_of_the_codec(
     solver, messages = Solver(Options(mode=("inc-l", "bayes-tree")[seed % 2])), StepMessages()
     for batch in random_steps(seed % 10_000, steps=5):
         solver.stage(batch)
-        account = solver.step().as_dict() | {"solver_ms": 0.25}
-        written = messages.write(answers, (epoch, revision, previous), account, *solver.pick_changed())
+        reported = solver.step().as_dict() | {"solver_ms": 0.25}
+        written = messages.write(answers, (epoch, revision, previous), reported, *solver.pick_changed())
         told = tuple(Variables(*group) for group in solver.changed())
         wanted = [
-            codec.encode_accepted(Accepted(sequence, epoch, revision, first_factor, len(answers), account))
+            codec.encode_accepted(Accepted(sequence, epoch, revision, first_factor, len(answers), reported))
             for sequence, first_factor in answers
         ]
-        delta = codec.encode_delta(Delta(epoch, revision, previous, told, account))
+        delta = codec.encode_delta(Delta(epoch, revision, previous, told, reported))
         assert written == [*wanted, delta]
-        assert messages.write_answers(answers, epoch, revision, account) == wanted
-        assert messages.write_delta((epoch, revision, previous), account, *solver.pick_changed()) == delta
+        assert messages.write_answers(answers, epoch, revision, reported) == wanted
+        assert messages.write_delta((epoch, revision, previous), reported, *solver.pick_changed()) == delta
 
 
 @pytest.mark.parametrize("count", [1, 3, 10, 31, 32, 255, 300, 2000])

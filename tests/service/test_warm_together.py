@@ -19,13 +19,13 @@ class Kernel:
     def __init__(self, name): self.__name__, self.__module__, self.py_func = name, "stub", lambda: None
 
 kernels = [Kernel(f"k{n}") for n in range(200)]
-together._list_missing = lambda: [k for k in kernels if not (Path(sys.argv[2]) / k.__name__).exists()]
+together.missing_kernels = lambda: [k for k in kernels if not (Path(sys.argv[2]) / k.__name__).exists()]
 def compiled(kernel):
     with open(sys.argv[3], "a") as log: log.write(kernel.__name__ + chr(10))
     (Path(sys.argv[2]) / kernel.__name__).touch()
     return ()
 together.iter_compile = compiled
-together._take_turns(Path(sys.argv[1]), print)
+together.take_turns(Path(sys.argv[1]), print)
 """
 
 
@@ -42,14 +42,14 @@ def test_every_kernel_is_compiled_once_by_any_process(tmp_path: Path) -> None:
 def test_those_that_die_leave_their_kernels_to_the_process_that_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(together.sys, "executable", "/bin/false")
     told: list[str] = []
-    together._share_out(2, told.append)
+    together.share_out(2, told.append)
     assert told == []
 
 
 def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is loaded is the same, to the bit, as what a later start loads."""
     missing = [type("Kernel", (), {"__name__": f"k{n}"}) for n in range(9)]
-    monkeypatch.setattr(together, "_list_missing", lambda: missing)
+    monkeypatch.setattr(together, "missing_kernels", lambda: missing)
     monkeypatch.setattr(together, "iter_compile", pytest.fail)
     monkeypatch.setenv("PYTHONUNBUFFERED", "1")
     asked: list[list[str]] = []
@@ -57,7 +57,7 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
 
     def compiling(command: list[str], **how: Any) -> subprocess.Popen:
         asked.append(command)
-        telling = f"for n in range(20_000): warm._tell('kernel {len(asked)} ' + str(n))"
+        telling = f"for n in range(20_000): warm.print_name('kernel {len(asked)} ' + str(n))"
         return popen([sys.executable, "-c", f"from factorbus.service.operations import warm\n{telling}"], **how)
 
     monkeypatch.setattr(together.subprocess, "Popen", compiling)
@@ -79,7 +79,7 @@ def test_memory_is_spent_to_save_time_where_each_process_has_plenty(
     monkeypatch.setattr(together, "available", lambda: gigabytes << 30)
     before = gc.get_threshold()
     try:
-        together._look_less()
+        together.collect_garbage_less()
         assert gc.isenabled() == collects
         assert (gc.get_threshold() > before) == collects
     finally:

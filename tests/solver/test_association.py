@@ -1,4 +1,4 @@
-"""Which sighting is of which landmark: against trying everything."""
+"""Which observation is of which landmark: against trying everything."""
 
 import numpy as np
 import pytest
@@ -15,18 +15,20 @@ from factorbus.solver.covariance.kernels.compatible import search
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), sightings=st.integers(1, 4), most=st.integers(0, 3), dim=st.sampled_from([2, 3]))
-def test_the_search_finds_what_trying_everything_finds(seed: int, sightings: int, most: int, dim: int) -> None:
+@given(
+    seed=st.integers(0, 2**32 - 1), observations=st.integers(1, 4), most=st.integers(0, 3), dim=st.sampled_from([2, 3])
+)
+def test_the_search_finds_what_trying_everything_finds(seed: int, observations: int, most: int, dim: int) -> None:
     rng = np.random.default_rng(seed)
-    pairs = [(i, int(l)) for i in range(sightings) for l in rng.permutation(4)[: rng.integers(0, most + 1)]]
+    pairs = [(i, int(l)) for i in range(observations) for l in rng.permutation(4)[: rng.integers(0, most + 1)]]
     size = len(pairs) * dim
     J = rng.normal(size=(size, size + 2))
     S = J @ J.T / (size + 2) + 0.3 * np.eye(size)
     r = rng.normal(size=size) * 1.5
     tried_at_most = 10**6
-    gates = np.concatenate([[0.0], threshold(dim * np.arange(1, sightings + 1), 0.9)])
-    begin = np.searchsorted(np.array([i for i, _ in pairs], np.int64), np.arange(sightings + 1))
-    best = np.empty(sightings, np.int64)
+    gates = np.concatenate([[0.0], threshold(dim * np.arange(1, observations + 1), 0.9)])
+    begin = np.searchsorted(np.array([i for i, _ in pairs], np.int64), np.arange(observations + 1))
+    best = np.empty(observations, np.int64)
     landmark = np.array([l for _, l in pairs], np.int64)
     tried = search(begin, landmark, np.ascontiguousarray(S), r.reshape(-1, dim), gates, tried_at_most, best)
     assert tried <= tried_at_most
@@ -66,7 +68,7 @@ def room(spread: float, sigma: float) -> tuple[Solver, np.ndarray]:
 
 
 def test_a_common_error_is_found_out_by_looking_at_all_together() -> None:
-    """A robot that has slipped: each sighting is nearest to a wrong landmark, all together are right."""
+    """A robot that has slipped: each observation is nearest to a wrong landmark, all together are right."""
     rng = np.random.default_rng(2)
     solver, n = Solver(Options(mode="bayes-tree")), 5
     row = np.column_stack([np.arange(n) * 0.6, np.full(n, 3.0)])
@@ -94,7 +96,7 @@ def test_a_common_error_is_found_out_by_looking_at_all_together() -> None:
     weight = np.tile([1e4, 0.0, 1e4], (n, 1))
     blocks, landmarks = CovarianceBlocks(solver.covariances.factored()), np.arange(2, 2 + n)
     found = associate(blocks, "landmark_se2", 1, seen, weight, landmarks, 0.99)
-    nearest = [found.landmarks[found.sightings == i][0] for i in range(n)]
+    nearest = [found.landmarks[found.observations == i][0] for i in range(n)]
     assert nearest[:-1] == (landmarks[1:]).tolist()
     assert found.landmark.tolist() == landmarks.tolist()
     assert found.complete
@@ -102,7 +104,7 @@ def test_a_common_error_is_found_out_by_looking_at_all_together() -> None:
 
 
 @pytest.mark.parametrize("kind", ["landmark_se2", "bearing_range_se2"])
-def test_sightings_are_told_apart_and_strangers_left_out(kind: str) -> None:
+def test_observations_are_told_apart_and_strangers_left_out(kind: str) -> None:
     solver, points = room(8.0, 0.05)
     x, y, t = next(values[0] for keys, values in ((g.keys, g.values) for g in solver.estimate()) if keys[0] == 1)
     turn = np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]])

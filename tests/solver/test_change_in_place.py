@@ -133,6 +133,7 @@ def random_change(solver: Solver, rng: np.random.Generator, weighed: list[Change
 @pytest.mark.parametrize("seed", range(2))
 def test_after_any_changes_the_map_is_that_of_the_factors_that_are_left(seed: int, world: str) -> None:
     rng, solver, weighed = np.random.default_rng(seed), Solver(Options(wildfire_threshold=0.0)), list[Change]()
+    made = compared = 0
     for batch in WORLDS[world](seed % 1000):
         solver.stage(batch)
         solver.step()
@@ -166,11 +167,14 @@ def test_after_any_changes_the_map_is_that_of_the_factors_that_are_left(seed: in
             here, there = copied(solver), copied(anew)
             for each in (here, there):
                 each.step(settle=True)
+            made += 1
             if here.chi2() == pytest.approx(there.chi2(), rel=1e-3, abs=1e-9):  # else these are two optima
                 assert here.chi2() == pytest.approx(there.chi2(), rel=1e-6 if world == "robots" else 1e-4, abs=1e-9)
                 assert apart(here, there) < 1e-6 or world != "robots"  # cameras hardly hold some directions
                 plain = not any(row[-2] for row in rows_of(solver).values())  # weights of losses converge slowly
                 assert report.chi2 <= 1.02 * here.chi2() + 1e-2 or not (report.converged and plain)
+                compared += 1
+    assert compared >= made - 1 > 3, "nearly all led to one optimum"
 
 
 def bars() -> tuple[Solver, int]:
@@ -181,9 +185,9 @@ def bars() -> tuple[Solver, int]:
     solver.stage(Batch((poses,)))
     solver.step()
     angles = np.arctan2(5.0, 2.0 - 4.0 * keys)[:, None]
-    sights = Factors("bearing_se2", np.stack([keys, np.full(3, 10)], 1), angles, np.full((3, 1), 1e4))
+    observations = Factors("bearing_se2", np.stack([keys, np.full(3, 10)], 1), angles, np.full((3, 1), 1e4))
     point = Variables("point2", np.array([10]), np.array([[2.0, 5.0]]))
-    first = solver.stage(Batch((point,), (sights,)))
+    first = solver.stage(Batch((point,), (observations,)))
     solver.step()
     return solver, first
 
@@ -259,7 +263,7 @@ def test_what_fails_behind_the_step_is_undone(what: str, monkeypatch: pytest.Mon
     change = [Change("remove_factors", np.array([first])), robust]
     with monkeypatch.context() as broken:
         if what == "soundness":
-            broken.setattr("factorbus.solver.changes.in_place._is_sound", lambda *_: False)
+            broken.setattr("factorbus.solver.changes.in_place.is_sound", lambda *_: False)
             assert try_change(solver, change) is None
         else:
             broken.setattr(type(tree_of(solver)), "step", lambda *_: 1 / 0)
@@ -372,7 +376,7 @@ def test_diagonal_blocks_are_kept_up_over_changes() -> None:
         upkeep.update()
         wanted = CovarianceBlocks(solver.covariances.factored()).diagonal()
         np.testing.assert_allclose(upkeep.diagonal()[:, :3, :3], wanted, rtol=1e-7, atol=1e-12)
-    assert upkeep.whole < upkeep.anew
+    assert (upkeep.whole, upkeep.anew) == (1, 13), "the first of them only goes through the whole tree"
 
 
 @pytest.mark.parametrize("mode", ["inc-l", "all-batch"])

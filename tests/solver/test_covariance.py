@@ -311,15 +311,15 @@ def test_why_a_factor(seed: int) -> None:
     twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     influence = 0.0
     for factor in range(solver.factor_count):
-        account = why_factor(blocks, factor)
-        keys = list(account.keys)
-        kind, _, z, W = next(each for each in twin.graph.factors if each[0] == account.kind and each[1] == keys)
+        explained = why_factor(blocks, factor)
+        keys = list(explained.keys)
+        kind, _, z, W = next(each for each in twin.graph.factors if each[0] == explained.kind and each[1] == keys)
         r, T, noise = twin.innovation(kind, keys, z, W[np.triu_indices(len(W))])
-        np.testing.assert_allclose(account.chi2, r @ W @ r, rtol=1e-7, atol=1e-12)
-        np.testing.assert_allclose(account.influence, np.trace(W @ T), rtol=1e-6, atol=1e-8)
-        influence += account.influence
-        if account.without is not None:
-            np.testing.assert_allclose(account.without, r @ np.linalg.solve(noise - T, r), rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(explained.chi2, r @ W @ r, rtol=1e-7, atol=1e-12)
+        np.testing.assert_allclose(explained.influence, np.trace(W @ T), rtol=1e-6, atol=1e-8)
+        influence += explained.influence
+        if explained.without is not None:
+            np.testing.assert_allclose(explained.without, r @ np.linalg.solve(noise - T, r), rtol=1e-4, atol=1e-9)
     # All factors together know as much as there is to know.
     assert influence == pytest.approx(len(twin.sigma), rel=1e-8)
     with pytest.raises(UnknownFactor):
@@ -331,18 +331,18 @@ def test_why_a_variable(mode: str) -> None:
     solver = solved(7, mode, steps=8)
     twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     for v in range(solver.variable_count):
-        account = why_variable(blocks, v, keeps_steps=mode == "bayes-tree")
-        assert account.fixed == fixed_in(solver)[v]
-        assert [each.factor for each in account.factors] == sorted(each.factor for each in account.factors)
-        assert len(account.factors) == len(graph_in(solver).factors_of(v))
-        if account.fixed:
-            assert not account.sigmas.any()
+        explained = why_variable(blocks, v, keeps_steps=mode == "bayes-tree")
+        assert explained.fixed == fixed_in(solver)[v]
+        assert [each.factor for each in explained.factors] == sorted(each.factor for each in explained.factors)
+        assert len(explained.factors) == len(graph_in(solver).factors_of(v))
+        if explained.fixed:
+            assert not explained.sigmas.any()
             continue
-        close(account.sigmas**2, np.diag(twin.joint([account.key])), twin.tell)
-        assert 0 < account.conditioning <= 1 + 1e-3
-        assert account.pivot >= 1 / account.sigmas.max() * (1 - 1e-9)
-        assert (account.linearized_step >= 1) == (mode == "bayes-tree")
-        assert account.as_dict()["factors"][0]["keys"]
+        close(explained.sigmas**2, np.diag(twin.joint([explained.key])), twin.tell)
+        assert 0 < explained.conditioning <= 1 + 1e-3
+        assert explained.pivot >= 1 / explained.sigmas.max() * (1 - 1e-9)
+        assert (explained.linearized_step >= 1) == (mode == "bayes-tree")
+        assert explained.as_dict()["factors"][0]["keys"]
 
 
 def kept_up(solver: Solver, batches) -> float:

@@ -74,7 +74,7 @@ def test_sparse_and_dense_twins_agree() -> None:
         solver.stage(batch)
         solver.step()
     factor = system_in(solver).factor
-    assert factor._have is Where.ROWS
+    assert factor.where is Where.ROWS
     for dense, sparse in ((dense_r(factor.rows), sparse_r(factor.rows)), (dense_lambda(solver), sparse_lambda(solver))):
         np.testing.assert_array_equal(dense[0], sparse[0].toarray())
         for a, b in zip(dense[1:], sparse[1:], strict=True):
@@ -126,7 +126,7 @@ def assert_is_the_factor(solver: Solver, rng: np.random.Generator, entrywise: bo
     assert np.abs(R.T @ (R @ x) - permuted @ x).max() <= RELATIVE * scale
     if entrywise:
         assert abs(R.T @ R - permuted).max() <= RELATIVE * scale
-    if rows is not system_in(solver).factor.rows or system_in(solver).factor._rows_have_d:
+    if rows is not system_in(solver).factor.rows or system_in(solver).factor.rows_have_d:
         assert np.abs(R.T @ d - eta[order]).max() <= RELATIVE * max(np.abs(eta).max(), scale * RELATIVE)
     out = np.empty(len(eta))
     squared = rows.forward(eta, out)
@@ -138,9 +138,9 @@ def assert_is_the_factor(solver: Solver, rng: np.random.Generator, entrywise: bo
 def rows_of(solver: Solver) -> BlockFactor | None:
     """R in block rows; a copy when it is in the fronts of a full factorization."""
     factor = system_in(solver).factor
-    if factor._have is Where.NOWHERE:
+    if factor.where is Where.NOWHERE:
         return None
-    if factor._have is Where.ROWS:
+    if factor.where is Where.ROWS:
         return factor.rows
     symbolic, arena = factor.elimination.fronts()
     copy = BlockFactor()

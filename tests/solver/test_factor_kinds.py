@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_factors import jacobians, pose_matrix, pose_vector, residual, sensors
+from naive.random_camera_factors import CAMERA_KINDS, random_camera_factor
 from naive.random_graphs import random_information, random_value
 from naive.random_others import OTHERS, random_other
-from naive.random_sights import SIGHTS, random_sight
 
 from factorbus.proto import kinds as wire
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -34,8 +34,8 @@ def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Fac
     """Values of the ends, a measurement far from them, and a graph of that one factor."""
     rng = np.random.default_rng(seed)
     base = kind.name.removesuffix("_mount")
-    if base in SIGHTS:
-        _, ends, z = random_sight(base, rng)
+    if base in CAMERA_KINDS:
+        _, ends, z = random_camera_factor(base, rng)
     else:
         ends = [random_value(end.name, rng) for end in FACTOR_KINDS[base].connects]
         z = random_other(base, ends, 1.0, rng) if base in OTHERS else drawn(kind, rng)
@@ -70,7 +70,7 @@ def test_residual_is_the_twins(kind: FactorKind, seed: int) -> None:
     r, _ = evaluate(kind, graph)
     twin = residual(kind.name, ends, z)
     near_turn = (np.abs(np.abs(twin) - np.pi) < 1e-9) & (
-        "_seen" not in kind.name and kind.name not in SIGHTS
+        "_seen" not in kind.name and kind.name not in CAMERA_KINDS
     )  # −π and π are the same angle
     np.testing.assert_allclose(np.where(near_turn, np.abs(r), r), np.where(near_turn, np.abs(twin), twin), atol=1e-9)
 
@@ -83,7 +83,7 @@ def test_jacobians_are_the_twins_central_differences(kind: FactorKind, seed: int
     base = kind.name.removesuffix("_mount")
     seen = sensors(ends) if base != kind.name else ends
     names = [end.name for end in kind.connects]
-    if base in SIGHTS:
+    if base in CAMERA_KINDS:
         for J, twin in zip(found, jacobians(kind.name, names, ends, z, 1e-4), strict=True):
             np.testing.assert_allclose(J, twin, rtol=1e-6, atol=5e-5)  # hundreds of pixels per radian
         return

@@ -39,7 +39,7 @@ def test_error_and_force_are_those_of_the_definition(world: str) -> None:
         dim = residual_dim(kind)
         lin, now = (evaluated(graph, f, values) for values in (tree.lin[0], graph.values))
         if lin[0][at.R_STATUS] != now[0][at.R_STATUS]:
-            continue  # a sight that lost its pixel or found it again
+            continue  # an observation that lost its pixel or found it again
         p = int(graph.fac[f, at.F_AT] + information_at(kind))
         weight = full(graph.payload[p : p + dim * (dim + 1) // 2])
         model, force = lin[0][:dim].copy(), 0.0

@@ -1,4 +1,4 @@
-"""Variables of any kinds marginalized, with poses, points and features in their border: the rest is what it was."""
+"""Variables of any kinds marginalized, with poses, points and features in their separator: the rest is what it was."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -134,7 +134,7 @@ def test_a_border_is_bounded_and_a_refusal_says_by_what() -> None:
     solver.step(settle=True)
     with pytest.raises(errors.TooConnected, match="at most 128") as refused:
         without(solver, [int(l[0])])
-    assert refused.value.detail["border"] == keys.tolist()
+    assert refused.value.detail["separator"] == keys.tolist()
     after = without(solver, [int(l[0]), int(keys[0])])
     assert len(find_joints(graph_in(after))[0].variables) == MOST
     assert_same(solver, after, [int(l[0]), int(keys[0])])
@@ -195,7 +195,7 @@ def test_a_window_past_trees_takes_constant_memory_and_is_where_the_whole_map_ha
     calm = partial(city_trees, sigma_xy_m=0.006, sigma_theta_rad=0.003, sensor=TreeSensor(sigma_m=0.03, share=0.6))
     for n, step in enumerate(calm(poses, seed=2, tree_share=0.6)):
         window.take(n, step.batch)
-    assert window.widest >= 8, "there are trees in the border"
+    assert window.widest >= 8, "there are trees in the separator"
     half = len(window.sizes) // 2
     assert max(window.sizes[half:]) <= 2.0 * max(window.sizes[:half]), "it does not grow with the length of the drive"
     window.solver.step(settle=True)

@@ -57,11 +57,11 @@ covariance = blocks.joint(np.array([0]))
 end = group.values[0]
 (J,) = jacobians("depth_se3", ["se3"], [end], np.array([pose[2] + 1.0]))
 assert abs(J[0] @ covariance @ J[0] - 1.0 / 101.0) < 1e-6
-row = int(solver._graph.ids_of(np.array([1]))[0])
-account = why_factor(blocks, row)
-assert account.kind == "depth_se3"
+row = int(graph_in(solver).ids_of(np.array([1]))[0])
+explained = why_factor(blocks, row)
+assert explained.kind == "depth_se3"
 (r,) = residual("depth_se3", [end], np.array([pose[2] + 1.0]))
-assert abs(account.residual[0] - r) < 1e-9
+assert abs(explained.residual[0] - r) < 1e-9
 here = Estimate(7, 1, (Variables("se3", np.array([1]), pose[None]),))
 try:
     fit_into(here, MapGraph(9, 1, batch), frame=(0, 0, 0, 0, 0, 0, 1.0), letters={"x": "y"})

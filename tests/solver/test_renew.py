@@ -126,7 +126,7 @@ def test_little_room_makes_no_difference(monkeypatch: pytest.MonkeyPatch) -> Non
     wide = Solver(Options.of(**OFTEN))
     for where in ("graph.factor_graph", "bayes_tree.tree"):
         monkeypatch.setattr(f"factorbus.solver.{where}.roomy", lambda need, _size: need)
-    grown, make_room = list[int](), CliqueTree._make_room
+    grown, make_room = list[int](), CliqueTree.make_room
     tight = Solver(Options.of(**OFTEN))
     tree = tree_of(tight)
     tree.numbers = tree.numbers[: int(tree.state[tl.S_NUMBERS])].copy()
@@ -138,7 +138,7 @@ def test_little_room_makes_no_difference(monkeypatch: pytest.MonkeyPatch) -> Non
             grown.append(1)
         make_room(tree)
 
-    monkeypatch.setattr(CliqueTree, "_make_room", watched)
+    monkeypatch.setattr(CliqueTree, "make_room", watched)
     for batch in steps("manhattan", 200):
         for solver in (wide, tight):
             solver.stage(batch)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
-from naive.solver_parts import graph_in
+from naive.solver_parts import graph_in, stepper_in
 from naive.tree_records import tree_of
 
 from factorbus.simulate import manhattan
@@ -40,7 +40,7 @@ def bits(groups: list[Group]) -> list[Any]:
     ]
 
 
-def account(report: Any) -> dict[str, Any]:
+def reported(report: Any) -> dict[str, Any]:
     told = report.as_dict()
     return {name: told[name] for name in told.keys() - {"phases_ms", "step_ms", "compiled_ms"}}
 
@@ -49,12 +49,12 @@ def account(report: Any) -> dict[str, Any]:
 def test_room_makes_no_difference(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("factorbus.solver.graph.factor_graph.roomy", lambda need, _size: need)
     monkeypatch.setattr("factorbus.solver.bayes_tree.tree.roomy", lambda need, _size: need)
-    grown, make_room = list[int](), CliqueTree._make_room
-    monkeypatch.setattr(CliqueTree, "_make_room", lambda tree: (grown.append(1), make_room(tree))[1])
+    grown, make_room = list[int](), CliqueTree.make_room
+    monkeypatch.setattr(CliqueTree, "make_room", lambda tree: (grown.append(1), make_room(tree))[1])
     tight, wide = cramped(), Solver(Options())
     for n, batch in enumerate(random_steps(seed, steps=60)):
         assert tight.stage(batch) == wide.stage(batch)
-        assert account(tight.step()) == account(wide.step()), f"step {n}"
+        assert reported(tight.step()) == reported(wide.step()), f"step {n}"
         assert bits(tight.estimate()) == bits(wide.estimate())
     assert len(grown) > 60
 
@@ -102,7 +102,7 @@ def test_an_estimate_is_the_callers_own_and_follows_what_is_taken_back() -> None
     assert bits(solver.estimate()) == before
     solver.stage(second)
     assert bits(solver.estimate()) != before
-    graph_in(solver).forget(solver._stepper._mark)  # type: ignore[union-attr]
+    graph_in(solver).forget(stepper_in(solver).mark)
     assert bits(solver.estimate()) == before
     with pytest.raises(errors.DuplicateVariable):
         solver.stage(first)

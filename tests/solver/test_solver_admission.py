@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
-from naive.solver_parts import graph_in, system_in
+from naive.solver_parts import graph_in, stepper_in, system_in
 from naive.tree_records import tree_of
 
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -39,7 +39,7 @@ def nan_info() -> np.ndarray:
     return info
 
 
-def sight(z: float = 5.0, model: float = 1.0) -> Batch:
+def observation(z: float = 5.0, model: float = 1.0) -> Batch:
     lens = [model, 400, 400, 320, 240, 0, 0, 0, 0, 0, 0]
     return Batch(
         (Variables("point3", np.array([300]), np.array([[0, 0, z]])),),
@@ -47,8 +47,8 @@ def sight(z: float = 5.0, model: float = 1.0) -> Batch:
     )
 
 
-def sight_with(k2: float) -> Batch:
-    batch = sight()
+def observation_with(k2: float) -> Batch:
+    batch = observation()
     batch.factors[0].measured[0, 9] = k2
     return batch
 
@@ -85,7 +85,7 @@ REFUSED = {
         "out_of_bounds",
         Batch((), (Factors("linear_point2", np.array([[100]]), np.array([[0, 0, 1, 0, 0, 1e25, 0, 0]]), I2),)),
     ),
-    "lens beyond its bound": ("out_of_bounds", sight_with(k2=1e300)),
+    "lens beyond its bound": ("out_of_bounds", observation_with(k2=1e300)),
     "indefinite information": ("not_positive_definite", Batch((), (edge(0, 1, info=I3 + np.eye(6)[1:2] * 2),))),
     "singular information": ("not_positive_definite", Batch((), (edge(0, 1, info=np.ones((1, 6))),))),
     "zero information": ("not_positive_definite", Batch((), (edge(0, 1, info=np.zeros((1, 6))),))),
@@ -102,8 +102,8 @@ REFUSED = {
     "range of zero": (
         "bad_range", Batch((), (Factors("bearing_range_se2", np.array([[0, 100]]), np.zeros((1, 2)), I2),)),
     ),
-    "point behind the camera": ("bad_sight", sight(z=-5.0)),
-    "lens of no model": ("bad_lens", sight(model=9.0)),
+    "point behind the camera": ("bad_observation", observation(z=-5.0)),
+    "lens of no model": ("bad_lens", observation(model=9.0)),
     "loss of no kind": ("bad_loss", Batch((), (edge(0, 1)._replace(loss="welsch", scale=np.ones(1)),))),
     "loss with a scale beyond its bound": (
         "bad_loss", Batch((), (edge(0, 1)._replace(loss="dcs", scale=np.full(1, 1e13)),)),
@@ -187,7 +187,7 @@ def everything(solver: Solver) -> bytes:
             ],
             [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size],
             normal_equations(system_in(solver).blocks, scalars)
-            if isinstance(solver._stepper, IncrementalSteps)
+            if isinstance(stepper_in(solver), IncrementalSteps)
             else cliques(solver, n, m, v),
             [solver.chi2(), [(g.kind, g.keys.tolist(), g.values.tobytes()) for g in solver.changed()]],
         ]
@@ -197,7 +197,9 @@ def everything(solver: Solver) -> bytes:
 def rows(solver: Solver, variables: int, factors: int) -> tuple[np.ndarray, np.ndarray]:
     """What the graph says of them; in the mode "bayes-tree" nobody writes where blocks of Λ are."""
     var, fac = graph_in(solver).var[:variables], graph_in(solver).fac[:factors]
-    return (var, fac) if isinstance(solver._stepper, IncrementalSteps) else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
+    return (
+        (var, fac) if isinstance(stepper_in(solver), IncrementalSteps) else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
+    )
 
 
 def normal_equations(blocks: HessianBlocks, scalars: int) -> list[bytes]:

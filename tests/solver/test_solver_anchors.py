@@ -18,9 +18,9 @@ def mapped_points(*points: tuple[float, float]) -> Solver:
     """A fixed pose 0 at the origin that sees points 100, 101, ..."""
     solver = Solver()
     keys = 100 + np.arange(len(points))
-    sight = landmarks(*((0, int(key)) for key in keys), z=[list(point) for point in points])
+    observation = landmarks(*((0, int(key)) for key in keys), z=[list(point) for point in points])
     pose = Variables("se2", np.array([0]), np.zeros((1, 3)), fixed=True)
-    solver.stage(Batch((pose, Variables("point2", keys)), (sight,)))
+    solver.stage(Batch((pose, Variables("point2", keys)), (observation,)))
     solver.step()
     return solver
 
@@ -42,7 +42,7 @@ def test_two_points_hold_a_pose_in_the_plane_and_one_does_not() -> None:
     assert caught.value.detail["factors"] == ["landmark_se2 (2, 100)"]
 
 
-def test_two_sightings_of_one_point_do_not_hold_a_pose() -> None:
+def test_two_observations_of_one_point_do_not_hold_a_pose() -> None:
     solver = mapped_points((2.0, 0.0), (0.0, 2.0))
     solver.stage(Batch((pose(1),), (landmarks((1, 100), (1, 100), z=[[2.0, 0.0], [2.1, 0.1]]),)))
     with pytest.raises(errors.Underconstrained):
@@ -82,7 +82,7 @@ def test_a_pose_in_space_needs_three_points_off_a_line() -> None:
         solver = Solver()
         keys = 100 + np.arange(3)
         origin = np.array([[0.0, 0, 0, 0, 0, 0, 1]])
-        sights = [
+        observations = [
             Factors("landmark_se3", np.stack([np.full(3, key), keys], 1), points, np.repeat(np.eye(3)[np.triu_indices(3)][None], 3, 0))  # noqa: E501
             for key in (0, 1)
         ]  # fmt: skip
@@ -93,7 +93,7 @@ def test_a_pose_in_space_needs_three_points_off_a_line() -> None:
                     Variables("point3", keys, points),
                     Variables("se3", np.array([1]), origin + np.eye(7)[:1] * 0.01),
                 ),
-                (Factors("prior_se3", np.array([[0]]), origin, I6), *sights),
+                (Factors("prior_se3", np.array([[0]]), origin, I6), *observations),
             )
         )
         return solver.step(settle=True).chi2

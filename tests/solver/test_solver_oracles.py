@@ -95,7 +95,7 @@ def test_the_optimum_is_gtsams(world) -> None:
 
 
 def as_bearing_range(group: Factors) -> Factors:
-    """Sightings of points as bearing and range, which GTSAM has too; other factors as they are."""
+    """Observations of points as bearing and range, which GTSAM has too; other factors as they are."""
     if group.kind != "landmark_se2":
         return group
     x, y = group.measured.T

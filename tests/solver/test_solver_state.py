@@ -17,7 +17,7 @@ from factorbus.solver.state import dump
 STEPS = 60
 
 
-def account(report: Any) -> dict[str, Any]:
+def reported(report: Any) -> dict[str, Any]:
     """All of a report but the times."""
     timed = {"phases_ms", "step_ms", "compiled_ms"}
     return {name: value for name, value in report.as_dict().items() if name not in timed}
@@ -56,7 +56,7 @@ def as_text_and_back(state: Any) -> Any:
 def same_step(one: Solver, other: Solver, batch: Batch, settle: bool) -> None:
     for solver in (one, other):
         solver.stage(batch)
-    assert account(one.step(settle)) == account(other.step(settle))
+    assert reported(one.step(settle)) == reported(other.step(settle))
     assert bits(one.changed()) == bits(other.changed())
 
 

@@ -12,6 +12,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Group, Options, Solver, errors, solve_batch
 from factorbus.solver.graph.factors import LENS_AT
 from factorbus.solver.kernels.jit.compile import DISABLED
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.lenses.layout import LIMIT
 from factorbus.solver.report import PhaseShares
 
@@ -55,7 +56,7 @@ def test_the_normal_equations_are_the_twins_and_have_the_bits_of_a_fresh_sum(see
     solver.step()
     twin.put(solver.estimate())
     graph, blocks = graph_in(solver), system_in(solver).blocks
-    starts = np.concatenate([[0], np.cumsum(graph.dims[: graph.counts[4]])])
+    starts = np.concatenate([[0], np.cumsum(graph.dims[: graph.counts[at.COLUMNS]])])
     dense = np.zeros((starts[-1], starts[-1]))
     for row, col, offset in zip(blocks.rows, blocks.cols, blocks.offsets, strict=True):
         assert row <= col

@@ -163,17 +163,17 @@ def test_a_component_that_shares_only_landmarks_is_brought_to_them() -> None:
     other = pose_matrix(np.array([3.0, 4.0, -2.0]))
     origin = Variables("se2", np.array([50]), np.zeros((1, 3)), fixed=True)
     tie = Factors("between_se2", np.array([[50, 0]]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 1, 0, 1]]))
-    sights = []
+    observations = []
     for base, T in ((0, np.eye(3)), (100, other)):
         for k in range(8):
             a = 2 * np.pi / 8 * k
             X = T @ pose_matrix(np.array([np.sin(a), 1 - np.cos(a), a]))
             seen = (np.linalg.inv(X) @ np.vstack([points.T, np.ones(6)]))[:2].T
             keys = np.stack([np.full(6, base + k), 200 + np.arange(6)], axis=1)
-            sights.append(Factors("landmark_se2", keys, seen, np.tile([9.0, 0, 9.0], (6, 1))))
+            observations.append(Factors("landmark_se2", keys, seen, np.tile([9.0, 0, 9.0], (6, 1))))
     batch = Batch(
         (origin, first[0], second[0], Variables("point2", 200 + np.arange(6), np.zeros((6, 2)))),
-        (tie, first[1], second[1], *sights),
+        (tie, first[1], second[1], *observations),
     )
     chi2, found = best_of(batch)
     assert chi2 < 1e-12

@@ -81,7 +81,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
     """A chain of poses, in the plane or in space, with loops of drawn lengths and points that are seen again."""
     plane = draw(st.booleans())
     pose, between = ("se2", "between_se2") if plane else ("se3", "between_se3")
-    point, sight = ("point2", "landmark_se2") if plane else ("point3", "landmark_se3")
+    point, observation = ("point2", "landmark_se2") if plane else ("point3", "landmark_se3")
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     zero = np.zeros(3) if plane else np.array([0, 0, 0, 0, 0, 0, 1.0])
     truth: dict[int, np.ndarray] = {0: zero}
@@ -102,10 +102,10 @@ def drives(draw: st.DrawFn) -> list[Batch]:
             truth[key] = truth[n][:size] + rng.uniform(1, 2, size)
             variables.append(Variables(point, np.array([key])))
             points.append(key)
-            factors.append(factor(sight, [n, key], truth, 0.1, rng))
+            factors.append(factor(observation, [n, key], truth, 0.1, rng))
         if points and draw(st.booleans()):
             seen = points[draw(st.integers(0, len(points) - 1))]
-            factors.append(factor(sight, [n, seen], truth, 0.1, rng))
+            factors.append(factor(observation, [n, seen], truth, 0.1, rng))
         steps.append(Batch(tuple(variables), tuple(factors)))
     return steps
 

@@ -10,7 +10,7 @@ from factorbus.solver.warm import _iter_groups
 
 def test_progress_is_told_of_every_group_and_a_second_time_costs_nothing() -> None:
     seen: list[str] = []
-    assert warm(seen.append) >= 0.0
+    warm(seen.append)
     assert {"model.linearize", "graph.admit", "graph.initialize", "graph.block_pattern", "model.retract"} <= set(
         seen
     ) or _jit.DISABLED

@@ -8,7 +8,7 @@ from factorbus.proto.symbols import symbol
 from factorbus.solver import Solver
 from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
-from factorbus.solver.covariance.why import FactorAccount, why_factor
+from factorbus.solver.covariance.why import FactorExplanation, why_factor
 
 # ρ of an outlier ten standard deviations off, k = 1, and what the map falls by without it (the others hold 1e4 times as
 # firmly): the case of a front end whose client was written from the page alone.
@@ -39,22 +39,22 @@ def fall(solver: Solver, factor: int) -> float:
     return solver.chi2() - without.chi2()
 
 
-def account_of(solver: Solver, factor: int) -> FactorAccount:
+def why(solver: Solver, factor: int) -> FactorExplanation:
     return why_factor(CovarianceBlocks(solver.covariances.factored()), factor)
 
 
 @pytest.mark.parametrize("loss", OUTLIER)
 def test_an_outlier_tells_its_residual_and_what_it_counts_apart(loss: str) -> None:
     solver = held_and_pulled(loss, 10.0, 2500.0)
-    account = account_of(solver, 4)
-    s = float(account.residual @ account.residual)
-    assert account.residual == pytest.approx([-10.0, 0.0], abs=1e-2)
-    assert account.weighted == pytest.approx(account.residual)
-    assert account.chi2 == pytest.approx(s) == pytest.approx(100.0, rel=1e-3)
-    assert account.rho == pytest.approx(OUTLIER[loss], rel=2e-3)
-    assert account.without == pytest.approx(fall(solver, 4), rel=1e-6)
-    assert account.without == pytest.approx(OUTLIER[loss], rel=2e-3)
-    assert 0.0 <= account.weight < 0.11
+    explained = why(solver, 4)
+    s = float(explained.residual @ explained.residual)
+    assert explained.residual == pytest.approx([-10.0, 0.0], abs=1e-2)
+    assert explained.weighted == pytest.approx(explained.residual)
+    assert explained.chi2 == pytest.approx(s) == pytest.approx(100.0, rel=1e-3)
+    assert explained.rho == pytest.approx(OUTLIER[loss], rel=2e-3)
+    assert explained.without == pytest.approx(fall(solver, 4), rel=1e-6)
+    assert explained.without == pytest.approx(OUTLIER[loss], rel=2e-3)
+    assert 0.0 <= explained.weight < 0.11
 
 
 @pytest.mark.parametrize("loss", ["", *OUTLIER])
@@ -64,11 +64,11 @@ def test_without_is_what_solving_again_gains(loss: str, apart: float) -> None:
     solver = held_and_pulled(loss, apart, 0.5) if loss else held_and_pulled("huber", apart, 0.5)
     if not loss:
         solver, *_ = with_changes(solver, [Change("loss", np.array([4]))], Batch(), True)
-    account = account_of(solver, 4)
-    assert account.loss == loss
-    assert account.without == pytest.approx(fall(solver, 4), rel=1e-7, abs=1e-12)
+    explained = why(solver, 4)
+    assert explained.loss == loss
+    assert explained.without == pytest.approx(fall(solver, 4), rel=1e-7, abs=1e-12)
     if not loss:
-        assert (account.weight, account.rho) == (1.0, account.chi2)
+        assert (explained.weight, explained.rho) == (1.0, explained.chi2)
 
 
 @pytest.mark.parametrize("loss", OUTLIER)
@@ -81,10 +81,10 @@ def test_a_false_loop_of_a_drive(loss: str) -> None:
     solver = Solver()
     solver.stage(Batch((start, Variables("se2", keys[1:])), (edges, loop._replace(loss=loss, scale=np.ones(1)))))
     solver.step(settle=True)
-    account = account_of(solver, 8)
-    assert account.chi2 > 20.0
-    assert account.without == pytest.approx(fall(solver, 8), rel=0.01, abs=1e-3)
-    assert solver.chi2() == pytest.approx(account.rho + sum(account_of(solver, f).rho for f in range(8)))
+    explained = why(solver, 8)
+    assert explained.chi2 > 20.0
+    assert explained.without == pytest.approx(fall(solver, 8), rel=0.01, abs=1e-3)
+    assert solver.chi2() == pytest.approx(explained.rho + sum(why(solver, f).rho for f in range(8)))
 
 
 def _information(rows: int, weight: float) -> np.ndarray:

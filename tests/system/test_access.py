@@ -151,7 +151,7 @@ TRIALS: dict[str, tuple[Callable[[Identity], bool], tuple[str, ...]]] = {
     "ask every map": (lambda me: me.answered("map/*/ask/stats"), ("ops",)),
     "ask everything": (lambda me: me.answered("**"), ()),
     "list maps": (lambda me: me.answered("admin/maps"), ("ops",)),
-    "read the service's account": (lambda me: me.answered("admin/stats"), ("ops",)),
+    "read the service's statistics": (lambda me: me.answered("admin/stats"), ("ops",)),
     "create a map": (lambda me: me.answered("admin/create", CREATE), ("ops",)),
     "drop a map": (lambda me: me.answered("admin/drop", codec.encode_map({"map": "none"})), ("ops",)),
     "fork a map": (lambda me: me.answered("admin/fork", codec.encode_map({"map": "none", "as": "n"})), ("ops",)),
@@ -214,8 +214,8 @@ def test_the_client_library_does_its_part_in_every_role(secured: Secured, hub: s
         picture.estimate.wait_for(accepted.revision)
         assert picture.estimate["x0"].tolist() == [1, 2, 0.5]
         assert kitchen.chi2(batch=True).batch == 0.0
-        (account,) = ops.stats()
-        assert [row["name"] for row in account["workers"]] == ["w1-a"]
+        (stats,) = ops.stats()
+        assert [row["name"] for row in stats["workers"]] == ["w1-a"]
         assert {row.name for row in ops.maps()} == {"kitchen", "hall"}
     with connect(hub, client="robot2", zenoh=secured.clients["robot1"], timeout_s=1) as bus:
         with pytest.raises(Unavailable, match="nobody replies"):  # another's name under one's own certificate

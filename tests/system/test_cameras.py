@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from bench.idp_map import Far, FrontEnd, judged
-from naive.random_sightings import CAMERAS
+from naive.random_cameras import CAMERAS
 
 from factorbus.client import Draft, connect
 from factorbus.proto.problems import Refused
@@ -13,9 +13,9 @@ from factorbus.simulate import monocular
 def test_features_become_points_while_a_mirror_follows(endpoint: str) -> None:
     with (
         connect(endpoint, client="camera") as bus,
-        bus.map("sights") as joined,
+        bus.map("observations") as joined,
         connect(endpoint, client="viewer") as other,
-        other.map("sights") as watched,
+        other.map("observations") as watched,
     ):
         far = Far(joined)
         front = FrontEnd(monocular(40, 4, points=80), far, convert_below=0.1, every=10)
@@ -55,5 +55,5 @@ def test_what_no_camera_can_see_is_refused_and_losses_travel(endpoint: str) -> N
         behind.point_seen("x0", "p1", camera, (380, 260), sigmas=(1, 1))
         with pytest.raises(Refused, match="behind the camera") as refused:
             joined.insert(behind)
-        assert refused.value.code == "bad_sight"
+        assert refused.value.code == "bad_observation"
         assert joined.estimate.revision == accepted.revision

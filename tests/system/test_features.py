@@ -1,7 +1,6 @@
 """Features for filters over the bus: cut up, done by processes that may die or freeze, and every one arrives."""
 
 import asyncio
-import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bare import Bare, bare
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 from processes import PATIENCE_S, Process
 
 from factorbus import idp
 from factorbus.client import aio, connect
 from factorbus.idp import minimal
 from factorbus.proto import keys
-from factorbus.proto.features import Ask, FeaturesAnswer, Segment, Sighting
+from factorbus.proto.features import Ask, FeaturesAnswer, Observations, Segment
 from factorbus.proto.features_codec import decode_answer, encode_ask
 from factorbus.proto.problems import BadShape, Refused, TooLarge, Unavailable
 from factorbus.proto.segments import PAGE, Memory
 
 Spawn = Callable[..., Process]
-Question = tuple[Sighting, np.ndarray, np.ndarray]
+Question = tuple[Observations, np.ndarray, np.ndarray]
 N = 200
 
 
@@ -60,12 +59,12 @@ def answer(client: Bare, ask: Ask) -> FeaturesAnswer:
 
 @pytest.fixture(scope="module")
 def question() -> Question:
-    """(sighting, all its y, all its new rows)."""
-    sighting = random_sighting(31, N, 3)[0]
-    seen = idp.see(sighting)
-    rows = np.empty((6 * N, sighting.width + 6 * N))
-    minimal.FeatureRows(sighting, seen).rows(0, N, rows)
-    return sighting, seen.y, rows
+    """(observations, all its y, all its new rows)."""
+    observations = random_observations(31, N, 3)[0]
+    seen = idp.see(observations)
+    rows = np.empty((6 * N, observations.width + 6 * N))
+    minimal.FeatureRows(observations, seen).rows(0, N, rows)
+    return observations, seen.y, rows
 
 
 def put_together(got: FeaturesAnswer) -> bytes:
@@ -79,18 +78,18 @@ def put_together(got: FeaturesAnswer) -> bytes:
 @contextmanager
 def into_memory(question: Question) -> Iterator[tuple[Ask, np.ndarray]]:
     """The question with shared memory for its rows: then little travels, and the way to a worker pays."""
-    sighting, _, rows = question
+    observations, _, rows = question
     with Memory(PAGE + rows.nbytes) as memory:
-        yield Ask(sighting, "rows", memory.segment(PAGE)), memory.array(PAGE, rows.shape)
+        yield Ask(observations, "rows", memory.segment(PAGE)), memory.array(PAGE, rows.shape)
 
 
 def test_every_process_computes_the_same_bits(spawn: Spawn, tmp_path: Path, question: Question) -> None:
-    sighting, y, rows = question
+    observations, y, rows = question
     with service(spawn, tmp_path) as (process, endpoint, client):
         workers: list[Process] = []
         for new, names in (("", {"in-place"}), ("a", {"a"}), ("b", {"a", "b"})):
             workers += [worker(spawn, client, endpoint, new)] if new else []
-            got = answer(client, Ask(sighting))
+            got = answer(client, Ask(observations))
             assert put_together(got) == y.tobytes()
             assert np.concatenate([done.shard.rows for done in got.shards]).tobytes() == rows.tobytes()
             with into_memory(question) as (ask, array):
@@ -98,7 +97,7 @@ def test_every_process_computes_the_same_bits(spawn: Spawn, tmp_path: Path, ques
                 assert {done.worker for done in stored.shards} == names
                 assert (put_together(stored), stored.clean) == (y.tobytes(), True)
                 assert array.tobytes() == rows.tobytes()
-        few = Sighting(sighting.camera, sighting.state, sighting.covariance, sighting.pixels[:2])
+        few = Observations(observations.camera, observations.state, observations.covariance, observations.pixels[:2])
         assert [done.worker for done in answer(client, Ask(few)).shards] == ["in-place"], "too little for the way"
         for each in (process, *workers):
             each.signal(signal.SIGTERM)
@@ -124,14 +123,14 @@ def test_while_all_are_busy_a_question_stays_whole(spawn: Spawn, tmp_path: Path,
 
 
 def test_a_question_that_cannot_be_is_refused_with_its_code(spawn: Spawn, tmp_path: Path, question: Question) -> None:
-    sighting, *_ = question
+    observations, *_ = question
     with service(spawn, tmp_path) as (_, endpoint, client):
         for helped in (False, True):
             if helped:
                 worker(spawn, client, endpoint, "a")
-            pixels = sighting.pixels.copy()
+            pixels = observations.pixels.copy()
             pixels[150] = [-10.0, 3.0]
-            bad = Sighting(sighting.camera, sighting.state, sighting.covariance, pixels)
+            bad = Observations(observations.camera, observations.state, observations.covariance, pixels)
             came = client.ask(keys.features_key("s"), encode_ask(Ask(bad)))
             assert isinstance(came, Refused)
             assert (came.code, came.detail["index"]) == ("bad_pixel", 150)
@@ -171,20 +170,20 @@ def test_a_front_end_on_another_host_gets_the_same_without_shared_memory(
     spawn: Spawn, tmp_path: Path, question: Question, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the service a file that has another nonce is a file on another host."""
-    sighting = question[0]
-    P = random_sighting(31, N, 3)[1]
-    x = np.concatenate([sighting.state, np.zeros(sighting.width - 13)])
-    after = minimal.covariance(P, sighting, idp.see(sighting)).P.tobytes()
-    large = random_sighting(32, 1070)[0]  # 330 MB as rows, 165 as the upper half
-    prior = {name: getattr(sighting, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
+    observations = question[0]
+    P = random_observations(31, N, 3)[1]
+    x = np.concatenate([observations.state, np.zeros(observations.width - 13)])
+    after = minimal.covariance(P, observations, idp.see(observations)).P.tobytes()
+    large = random_observations(32, 1070)[0]  # 330 MB as rows, 165 as the upper half
+    prior = {name: getattr(observations, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
     with service(spawn, tmp_path) as (_, endpoint, _), connect(endpoint, client="camera", timeout_s=60) as bus:
-        with bus.features(sighting.camera, **prior) as front:
-            assert front.grow(x, P, sighting.pixels).P.tobytes() == after
-            assert front._shared
+        with bus.features(observations.camera, **prior) as front:
+            assert front.grow(x, P, observations.pixels).P.tobytes() == after
+            assert front.shares_memory
             monkeypatch.setattr(Memory, "segment", segment_elsewhere)
-            assert front.grow(x, P, sighting.pixels).P.tobytes() == after
-            assert not front._shared, "so the upper half is sent from now on"
-            assert front.grow(x, P, sighting.pixels).P.tobytes() == after
+            assert front.grow(x, P, observations.pixels).P.tobytes() == after
+            assert not front.shares_memory, "so the upper half is sent from now on"
+            assert front.grow(x, P, observations.pixels).P.tobytes() == after
         with bus.features(large.camera, **prior) as front:
             grown = front.grow(large.state, large.covariance, large.pixels)
             assert grown.P.shape == (13 + 6 * 1070,) * 2
@@ -193,35 +192,43 @@ def test_a_front_end_on_another_host_gets_the_same_without_shared_memory(
                 front.grow(large.state, large.covariance, np.tile(large.pixels, (2, 1)))
 
 
+TRUE_SEGMENT = Memory.segment
+
+
 def segment_elsewhere(memory: Memory, offset: int) -> Segment:
-    return Segment(os.getpid(), memory._descriptor, "0" * 32, memory.size, offset)
+    return TRUE_SEGMENT(memory, offset)._replace(nonce="0" * 32)
 
 
 def test_a_filter_gets_factors_and_its_problems_by_name(spawn: Spawn, tmp_path: Path, question: Question) -> None:
-    sighting, y, rows = question
-    x = np.concatenate([sighting.state, np.zeros(sighting.width - 13)])
-    prior = {name: getattr(sighting, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
+    observations, y, rows = question
+    x = np.concatenate([observations.state, np.zeros(observations.width - 13)])
+    prior = {name: getattr(observations, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
     with (
         service(spawn, tmp_path) as (_, endpoint, _),
         connect(endpoint, client="camera", timeout_s=60) as bus,
-        bus.features(sighting.camera, service="s", **prior) as front,
+        bus.features(observations.camera, service="s", **prior) as front,
     ):
-        parts = front.factor(x, sighting.covariance, sighting.pixels)
+        parts = front.factor(x, observations.covariance, observations.pixels)
         assert parts.y.tobytes() == y.tobytes()
-        m = sighting.width
+        m = observations.width
         np.testing.assert_allclose(parts.block(3, 170), rows[18:24, m + 6 * 170 :][:, :6], atol=1e-13)
         with pytest.raises(Refused) as refused:
-            front.factor(x, sighting.covariance, np.array([[np.inf, 0.0]]))
+            front.factor(x, observations.covariance, np.array([[np.inf, 0.0]]))
         assert refused.value.code == "bad_pixel"
 
         async def on_a_loop() -> tuple[bytes, bytes]:
-            async with aio.connect(endpoint, client="loop") as loop, loop.features(sighting.camera, **prior) as slow:
-                parts = await slow.factor(x, sighting.covariance, sighting.pixels)
-                return parts.y.tobytes(), (await slow.grow(x[:13], np.eye(13), sighting.pixels)).y.tobytes()
+            async with (
+                aio.connect(endpoint, client="loop") as loop,
+                loop.features(observations.camera, **prior) as slow,
+            ):
+                parts = await slow.factor(x, observations.covariance, observations.pixels)
+                return parts.y.tobytes(), (await slow.grow(x[:13], np.eye(13), observations.pixels)).y.tobytes()
 
         assert asyncio.run(on_a_loop()) == (y.tobytes(), y.tobytes())
         for wrong in (x[:12], x[None]):
             with pytest.raises(BadShape):
-                front.grow(wrong, np.eye(13), sighting.pixels)
+                front.grow(wrong, np.eye(13), observations.pixels)
         with pytest.raises(Unavailable):
-            bus.features(sighting.camera, service="another").factor(x, sighting.covariance, sighting.pixels, 0.2)
+            bus.features(observations.camera, service="another").factor(
+                x, observations.covariance, observations.pixels, 0.2
+            )

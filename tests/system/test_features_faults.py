@@ -13,7 +13,7 @@ from random import Random
 
 import numpy as np
 import pytest
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 from processes import Process
 
 from factorbus import idp
@@ -86,9 +86,9 @@ def test_no_feature_is_lost_doubled_or_out_of_order(spawn: Spawn, endpoint: str)
     print("seed 7")
     questions = []
     for seed in range(4):
-        sighting, P = random_sighting(seed, N, seed)
-        seen = idp.see(sighting)
-        questions.append((sighting, P, seen.y, minimal.covariance(P, sighting, seen).P))
+        observations, P = random_observations(seed, N, seed)
+        seen = idp.see(observations)
+        questions.append((observations, P, seen.y, minimal.covariance(P, observations, seen).P))
     workers = Workers(spawn, endpoint)
     helped: set[str] = set()
     retried = asked = 0
@@ -98,9 +98,9 @@ def test_no_feature_is_lost_doubled_or_out_of_order(spawn: Spawn, endpoint: str)
             # Under load the first questions are answered before all workers have started.
             while sum(workers.faults.values()) < FAULTS or len(helped - {"in-place"}) <= 2:
                 under_way = []
-                for (sighting, P, _, _), features in zip(questions, fronts, strict=True):
-                    x = np.concatenate([sighting.state, np.zeros(sighting.width - 13)])
-                    under_way.append(features.send(x, P, sighting.pixels))
+                for (observations, P, _, _), features in zip(questions, fronts, strict=True):
+                    x = np.concatenate([observations.state, np.zeros(observations.width - 13)])
+                    under_way.append(features.send(x, P, observations.pixels))
                     if chance.random() < 0.5:
                         workers.hurt(chance)
                 for growing, (_, _, y, after) in zip(under_way, questions, strict=True):
@@ -115,6 +115,6 @@ def test_no_feature_is_lost_doubled_or_out_of_order(spawn: Spawn, endpoint: str)
     assert retried >= FAULTS // 10, "the faults did hit in mid-job"
 
 
-def front(bus, sighting) -> Features:
-    prior = {name: getattr(sighting, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
-    return bus.features(sighting.camera, **prior)
+def front(bus, observations) -> Features:
+    prior = {name: getattr(observations, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
+    return bus.features(observations.camera, **prior)

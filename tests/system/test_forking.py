@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from factorbus.proto import codec, keys
 from factorbus.proto.problems import BadName, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.journal.library import make_map_solver
+from factorbus.service.questions.answers import Copied, Question
 
 SIGMAS = (0.1, 0.1, 0.02)
 
@@ -194,9 +196,15 @@ def test_a_fork_is_there_after_a_kill_bit_for_bit(
 
 def test_a_fork_for_which_there_is_no_memory_takes_none() -> None:
     folder = make_map_solver("bayes-tree", {}, 7, Limits())
-    assert folder._copied(0).bytes > 0
-    assert folder._copied(0).state is None
-    assert folder._copied(1 << 40).state is not None
+
+    def copied(room: int) -> Copied:
+        taken = folder.snapshot([Question("copy", ask=SimpleNamespace(room=room))]).copied
+        assert taken is not None
+        return taken
+
+    assert copied(0).bytes > 0
+    assert copied(0).state is None
+    assert copied(1 << 40).state is not None
 
 
 def test_asyncio_and_the_command_line_fork(endpoint: str) -> None:

@@ -89,10 +89,10 @@ class Events:
 
 def health(bus: Bus, name: str) -> tuple[bool, bool, str, list[str]]:
     """alive, ready, the journal's problem, and what is missing."""
-    account = next(row for row in bus.stats() if any(each["name"] == name for each in row["maps"]))
-    journal = next(each["journal"] for each in account["maps"] if each["name"] == name)
+    stats = next(row for row in bus.stats() if any(each["name"] == name for each in row["maps"]))
+    journal = next(each["journal"] for each in stats["maps"] if each["name"] == name)
     assert journal["blocked"] == bool(journal["problem"])
-    return account["alive"], account["ready"], journal["problem"], account["missing"]
+    return stats["alive"], stats["ready"], journal["problem"], stats["missing"]
 
 
 def check_refused(endpoint: str, name: str) -> None:

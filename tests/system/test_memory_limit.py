@@ -60,20 +60,20 @@ def test_it_refuses_before_the_limit_and_takes_again_after_a_drop(tmp_path: Path
         with pytest.raises(Refused) as no_copy:
             bus.fork("first", "copy")
         assert no_copy.value.code == "out_of_memory"
-        account = bus.stats()[0]
-        assert resident(account["pid"]) < limit / 0.8, "by default the limit leaves a fifth for a step under way"
-        assert resident(account["pid"]) > limit - ROOM // 2, "not long before, either"
-        assert account["alive"]
-        assert account["ready"]
-        assert account["maps"][0]["refusals"] == {"out_of_memory": 1}
+        stats = bus.stats()[0]
+        assert resident(stats["pid"]) < limit / 0.8, "by default the limit leaves a fifth for a step under way"
+        assert resident(stats["pid"]) > limit - ROOM // 2, "not long before, either"
+        assert stats["alive"]
+        assert stats["ready"]
+        assert stats["maps"][0]["refusals"] == {"out_of_memory": 1}
         assert sum(len(group.keys) for group in first.ask_estimate().variables) == taken * POSES
-        before = resident(account["pid"])
+        before = resident(stats["pid"])
         for count, code in ((1000, "out_of_memory"), (4000, "too_large"), (1_000_000, "too_large")):
             with pytest.raises(Refused) as no_room:
                 first.uncertainty.joint(np.arange(count) % 3000)  # keys, some of them again and again
             assert no_room.value.code == code
             assert no_room.value.detail["size"] > no_room.value.detail["limit"]
-        assert resident(account["pid"]) < before + (64 << 20), "nothing was allocated for what is refused"
+        assert resident(stats["pid"]) < before + (64 << 20), "nothing was allocated for what is refused"
         assert first.uncertainty.joint([0, 1]).shape == (6, 6)
         bus.drop("first")
         with bus.map("second", mirror=False) as second:

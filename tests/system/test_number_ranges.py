@@ -14,7 +14,7 @@ from bare import Bare, bare, edge, keys_of, pose, start
 from factorbus.proto import asking_codec, codec, features_codec, keys, repair_codec
 from factorbus.proto.asking import AskAssociate, AskCovariance, AskGate, AskRepair, AskWhy
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import Ask, Sighting
+from factorbus.proto.features import Ask, Observations
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.problems import Refused
 
@@ -53,14 +53,14 @@ def messages() -> dict[str, tuple[str, bytes]]:
     insert = Insert(1, Batch((new,), (soft,)), True, 0, 0.1, changes)
     camera = Camera("radtan", (500.0, 500, 320, 240, 0, 0, 0, 0), 640, 480)
     state = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], float)
-    sighting = Sighting(camera, state, np.eye(13), np.array([[300.0, 200.0]]), 0.5, 0.2, 1.0)
-    sights = AskAssociate(int(x[1]), "landmark_se2", np.ones((1, 2)), np.array([[1.0, 0, 1.0]]), l1, 0.9)
+    observations = Observations(camera, state, np.eye(13), np.array([[300.0, 200.0]]), 0.5, 0.2, 1.0)
+    seen = AskAssociate(int(x[1]), "landmark_se2", np.ones((1, 2)), np.array([[1.0, 0, 1.0]]), l1, 0.9)
     asked = {
         "estimate": codec.encode_keys_asked(x),
         "chi2": codec.encode_map({"batch": False, "timeout_s": 5.0}),
         "export": codec.encode_map({"format": "g2o"}),
         "gate": asking_codec.encode_ask_gate(AskGate((soft,), 0.9)),
-        "associate": asking_codec.encode_ask_associate(sights),
+        "associate": asking_codec.encode_ask_associate(seen),
         "repair": repair_codec.encode_ask_repair(AskRepair(np.array([1]), 0.9, True)),
         "covariance": asking_codec.encode_ask_covariance(AskCovariance("cross", x, l1)),
     }
@@ -71,7 +71,7 @@ def messages() -> dict[str, tuple[str, bytes]]:
     made["create"] = keys.admin_key("create"), codec.encode_map({"map": "ranges", "mode": "auto"})
     made["drop"] = keys.admin_key("drop"), codec.encode_map({"map": "nowhere", "revision": 999})
     made["fork"] = keys.admin_key("fork"), codec.encode_map({"map": "ranges", "as": "ranges", "request": 1})
-    made["features"] = "FEATURES", features_codec.encode_ask(Ask(sighting))
+    made["features"] = "FEATURES", features_codec.encode_ask(Ask(observations))
     return made
 
 

@@ -108,7 +108,7 @@ def test_candidates_are_gated_and_weighed(square: tuple[Map, Solver]) -> None:
     np.testing.assert_allclose(joined.uncertainty.gate(many).distance[:2], found.distance, rtol=1e-6, atol=1e-9)
 
 
-def test_sightings_are_associated(square: tuple[Map, Solver]) -> None:
+def test_observations_are_associated(square: tuple[Map, Solver]) -> None:
     joined, _ = square
     seen = [joined.uncertainty.relative([("x8", name)]).groups[0].values[0] for name in ("l3", "l1")]
     found = joined.uncertainty.associate("x8", "landmark_se2", [*seen, [50.0, 50.0]], information=np.diag([25.0, 25.0]))
@@ -120,12 +120,12 @@ def test_sightings_are_associated(square: tuple[Map, Solver]) -> None:
 
 def test_why(square: tuple[Map, Solver]) -> None:
     joined, _ = square
-    account = joined.uncertainty.why("l1")
-    assert account.variable["kind"] == "point2"
-    assert {factor["kind"] for factor in account.variable["factors"]} == {"landmark_se2"}
-    assert account.step["because"]
-    factor = joined.uncertainty.why(factor=account.variable["factors"][0]["factor"]).factor
-    first = account.variable["factors"][0]
+    explained = joined.uncertainty.why("l1")
+    assert explained.variable["kind"] == "point2"
+    assert {factor["kind"] for factor in explained.variable["factors"]} == {"landmark_se2"}
+    assert explained.step["because"]
+    factor = joined.uncertainty.why(factor=explained.variable["factors"][0]["factor"]).factor
+    first = explained.variable["factors"][0]
     assert factor.keys() == first.keys()
     assert (factor["kind"], factor["keys"], factor["chi2"]) == (first["kind"], first["keys"], first["chi2"])
     assert factor["influence"] == pytest.approx(first["influence"], rel=1e-9)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bare import Bare, bare, edge, pose, start
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 from processes import Process, processes
 
 from factorbus import idp
 from factorbus.idp import minimal
 from factorbus.proto import codec, keys
-from factorbus.proto.features import Ask, Sighting
+from factorbus.proto.features import Ask, Observations
 from factorbus.proto.features_codec import decode_answer, encode_ask
 from factorbus.proto.messages import Batch, Chi2, Insert
 from factorbus.proto.segments import PAGE, Memory
@@ -113,21 +113,23 @@ def test_one_that_ended_before_it_had_converged_is_believed_and_that_is_told(ben
 
 
 @pytest.fixture(scope="module")
-def question() -> tuple[Sighting, bytes, np.ndarray]:
-    """(sighting, its y, its new rows)."""
-    sighting = random_sighting(31, N, 3)[0]
-    seen = idp.see(sighting)
-    rows = np.empty((6 * N, sighting.width + 6 * N))
-    minimal.FeatureRows(sighting, seen).rows(0, N, rows)
-    return sighting, seen.y.tobytes(), rows
+def question() -> tuple[Observations, bytes, np.ndarray]:
+    """(observations, its y, its new rows)."""
+    observations = random_observations(31, N, 3)[0]
+    seen = idp.see(observations)
+    rows = np.empty((6 * N, observations.width + 6 * N))
+    minimal.FeatureRows(observations, seen).rows(0, N, rows)
+    return observations, seen.y.tobytes(), rows
 
 
 @pytest.mark.parametrize("fault", [*BOTH, "y_nan", "y_elsewhere", "shard_of_another", "rows_short", "neither"])
-def test_wrong_features_are_made_anew(bench: Bench, question: tuple[Sighting, bytes, np.ndarray], fault: str) -> None:
-    sighting, y, rows = question
+def test_wrong_features_are_made_anew(
+    bench: Bench, question: tuple[Observations, bytes, np.ndarray], fault: str
+) -> None:
+    observations, y, rows = question
     name = bench.worker(fault)
     with Memory(PAGE + rows.nbytes) as memory:
-        came = bench.client.ask(keys.features_key("s"), encode_ask(Ask(sighting, "rows", memory.segment(PAGE))))
+        came = bench.client.ask(keys.features_key("s"), encode_ask(Ask(observations, "rows", memory.segment(PAGE))))
         assert isinstance(came, bytes), came
         got = decode_answer(came)
         assert {done.worker for done in got.shards} == {"in-place"}
@@ -143,12 +145,14 @@ def test_one_whose_probes_are_wrong_gets_no_job(bench: Bench) -> None:
     assert bench.optimum().worker == "in-place"
 
 
-def test_one_that_does_only_batch_gets_only_batch(bench: Bench, question: tuple[Sighting, bytes, np.ndarray]) -> None:
-    sighting, y, rows = question
+def test_one_that_does_only_batch_gets_only_batch(
+    bench: Bench, question: tuple[Observations, bytes, np.ndarray]
+) -> None:
+    observations, y, rows = question
     name = bench.worker("only_batch")
     assert bench.optimum().worker == name
     with Memory(PAGE + rows.nbytes) as memory:
-        came = bench.client.ask(keys.features_key("s"), encode_ask(Ask(sighting, "rows", memory.segment(PAGE))))
+        came = bench.client.ask(keys.features_key("s"), encode_ask(Ask(observations, "rows", memory.segment(PAGE))))
         assert isinstance(came, bytes), came
         got = decode_answer(came)
     assert ([done.worker for done in got.shards], got.clean) == (["in-place"], True), "it was not asked"
@@ -158,9 +162,9 @@ def test_one_that_does_only_batch_gets_only_batch(bench: Bench, question: tuple[
 
 def test_operators_are_told(bench: Bench) -> None:
     name = bench.worker("chi2_negative")
-    before, lines = account(bench)["wrong_answers"], warnings(bench, name)
+    before, lines = stats(bench)["wrong_answers"], warnings(bench, name)
     bench.optimum()
-    assert account(bench)["wrong_answers"] == before + 1
+    assert stats(bench)["wrong_answers"] == before + 1
     (line,) = warnings(bench, name)[len(lines) :]
     assert "answered a batch job with χ² -1, where its values have" in line
 
@@ -170,7 +174,7 @@ def warnings(bench: Bench, name: str) -> list[str]:
     return [line for line in bench.service.errors().splitlines() if "WARNING" in line and f"worker {name} " in line]
 
 
-def account(bench: Bench) -> dict:
+def stats(bench: Bench) -> dict:
     came = bench.client.ask(keys.admin_key("stats"))
     assert isinstance(came, bytes)
     return codec.decode_map(came)

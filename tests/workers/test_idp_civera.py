@@ -8,7 +8,7 @@ import pytest
 from factorbus import idp
 from factorbus.idp import classical, independent, lenses, minimal, predict
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import Sighting
+from factorbus.proto.features import Observations
 
 
 @pytest.fixture(scope="module")
@@ -24,26 +24,28 @@ def camera(folder: Path) -> Camera:
     return Camera("radial", tuple(numbers[n] for n in names), int(numbers["ncols"]), int(numbers["nrows"]))
 
 
-def sighting_of(folder: Path, camera: Camera, name: str) -> tuple[Sighting, np.ndarray]:
+def observations_of(folder: Path, camera: Camera, name: str) -> tuple[Observations, np.ndarray]:
     """(what was seen, P before) of one of the steps that add a feature."""
     lines = (line.split() for line in (folder / name / "input.txt").read_text().splitlines() if line[0] != "#")
     given = {name: list(map(float, numbers)) for name, *numbers in lines}
     P = np.loadtxt(folder / name / "P_before.txt")
     state = np.loadtxt(folder / name / ("xv.txt" if name.endswith("2") else "x_before.txt"))[:13]
     rho = given.get("rho0", [1.0])[0]
-    return Sighting(camera, state, P[:13], np.array([given["uvd"]]), rho, given["std_rho"][0], given["std_pixel"][0]), P
+    return Observations(
+        camera, state, P[:13], np.array([given["uvd"]]), rho, given["std_rho"][0], given["std_pixel"][0]
+    ), P
 
 
 @pytest.mark.parametrize("name", ["add_feature_1", "add_feature_2"])
 def test_a_feature_is_added_as_the_filter_adds_it(folder: Path, camera: Camera, name: str) -> None:
-    sighting, P = sighting_of(folder, camera, name)
+    observations, P = observations_of(folder, camera, name)
     wanted = np.loadtxt(folder / name / "P_after.txt")
-    seen = idp.see(sighting)
-    A, B = idp.jacobians(sighting, seen)
+    seen = idp.see(observations)
+    A, B = idp.jacobians(observations, seen)
     for found in (
-        classical.covariance(P, A, B, idp.padd(sighting)).P,
-        independent.covariance(P, A, B, idp.padd(sighting)).P,
-        minimal.covariance(P, sighting, seen).P,
+        classical.covariance(P, A, B, idp.padd(observations)).P,
+        independent.covariance(P, A, B, idp.padd(observations)).P,
+        minimal.covariance(P, observations, seen).P,
     ):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
     if name == "add_feature_1":

@@ -11,40 +11,40 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive import dense_idp
-from naive.random_sightings import CAMERAS, random_sighting
+from naive.random_cameras import CAMERAS, random_observations
 
 from factorbus import idp
 from factorbus.idp import classical, independent, minimal
-from factorbus.proto.features import Sighting
+from factorbus.proto.features import Observations
 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def everything(sighting: Sighting, P: np.ndarray) -> tuple[classical.Counted, ...]:
+def everything(observations: Observations, P: np.ndarray) -> tuple[classical.Counted, ...]:
     """(classical, independent, minimal)."""
-    seen = idp.see(sighting)
-    A, B = idp.jacobians(sighting, seen)
-    padd = idp.padd(sighting)
+    seen = idp.see(observations)
+    A, B = idp.jacobians(observations, seen)
+    padd = idp.padd(observations)
     return (
         classical.covariance(P, A, B, padd),
         independent.covariance(P, A, B, padd),
-        minimal.covariance(P, sighting, seen),
+        minimal.covariance(P, observations, seen),
     )
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize(("n", "existing"), [(1, 0), (3, 0), (7, 1), (2, 30)])
 def test_the_three_are_one(n: int, existing: int, camera: str) -> None:
-    sighting, P = random_sighting(n, n, existing, camera)
-    A, B = idp.jacobians(sighting, idp.see(sighting))
-    wanted = dense_idp.added(P, A, B, idp.padd(sighting))
-    for found in everything(sighting, P):
+    observations, P = random_observations(n, n, existing, camera)
+    A, B = idp.jacobians(observations, idp.see(observations))
+    wanted = dense_idp.added(P, A, B, idp.padd(observations))
+    for found in everything(observations, P):
         np.testing.assert_allclose(found.P, wanted, rtol=0, atol=1e-12 * abs(wanted).max())
 
 
 @pytest.mark.parametrize(("n", "existing"), [(1, 200), (5, 120), (40, 3)])
 def test_the_three_are_one_with_many_features_in_the_state(n: int, existing: int) -> None:
-    first, second, third = (found.P for found in everything(*random_sighting(n, n, existing)))
+    first, second, third = (found.P for found in everything(*random_observations(n, n, existing)))
     np.testing.assert_allclose(second, first, rtol=0, atol=1e-12 * abs(first).max())
     np.testing.assert_allclose(third, first, rtol=0, atol=1e-12 * abs(first).max())
 
@@ -52,15 +52,15 @@ def test_the_three_are_one_with_many_features_in_the_state(n: int, existing: int
 @settings(max_examples=40)
 @given(seed=seeds, n=st.integers(1, 6), existing=st.integers(0, 12))
 def test_the_three_are_one_on_random_states(seed: int, n: int, existing: int) -> None:
-    sighting, P = random_sighting(seed, n, existing)
-    first, second, third = (found.P for found in everything(sighting, P))
+    observations, P = random_observations(seed, n, existing)
+    first, second, third = (found.P for found in everything(observations, P))
     scale = abs(first).max()
     np.testing.assert_allclose(second, first, rtol=0, atol=1e-12 * scale)
     np.testing.assert_allclose(third, first, rtol=0, atol=1e-12 * scale)
 
 
 def test_the_paper_s_counts_come_out_and_ours_is_below() -> None:
-    counts = [found.multiplications for found in everything(*random_sighting(1, 3))]
+    counts = [found.multiplications for found in everything(*random_observations(1, 3))]
     assert counts[:2] == [87_702, 10_782]
     assert counts[2] == 468
 
@@ -68,7 +68,7 @@ def test_the_paper_s_counts_come_out_and_ours_is_below() -> None:
 @pytest.mark.parametrize("n", [1, 2, 5, 20])
 def test_counts_follow_the_paper_s_formulas(n: int) -> None:
     """The formulas of its Figure 9; the counts come from the code that runs."""
-    classical_, independent_, minimal_ = everything(*random_sighting(n, n))
+    classical_, independent_, minimal_ = everything(*random_observations(n, n))
     sizes = [(19 + 6 * k, 16 + 6 * k) for k in range(n)]
     assert classical_.multiplications == sum(a * b * b + a * a * b for a, b in sizes)
     assert independent_.multiplications == 2190 * n + 468 * n * n
@@ -77,7 +77,7 @@ def test_counts_follow_the_paper_s_formulas(n: int) -> None:
 
 COUNTING = """
 import numpy as np
-from naive.random_sightings import random_sighting
+from naive.random_cameras import random_observations
 from factorbus import idp
 from factorbus.idp import classical, independent, minimal
 from factorbus.idp.kernels import minimal as kernels
@@ -102,10 +102,10 @@ def check(name, said):
     Number.made = 0
 
 n, m = 4, 25
-sighting, P = random_sighting(9, n, 2)
-seen = idp.see(sighting)
-A, B = idp.jacobians(sighting, seen)
-padd = idp.padd(sighting)
+observations, P = random_observations(9, n, 2)
+seen = idp.see(observations)
+A, B = idp.jacobians(observations, seen)
+padd = idp.padd(observations)
 J, padded = classical.step_matrices(P, A[0], B[0], padd)
 check("classical", counted_product(counting(J), counting(padded), room(*J.shape)))
 At = A.transpose(2, 0, 1).reshape(13, -1)
@@ -117,7 +117,7 @@ rows.add_own_blocks(0, n, counting(B), counting(padd), room(12, 6), out, counts)
 check("independent", counts.sum())
 U, S, V, W, own = room(6, m), room(3, 3), room(n, 6), room(n, 6), room(n, 3)
 turn, slope = counting(seen.turn), counting(seen.slope)
-x = sighting.state
+x = observations.state
 check("share", kernels.share(x, counting(P[:13]), U, S))
 check("spread", kernels.feature_factors(0, turn, U, S, V, W))
 check("own", kernels.own_variances(slope, 1.5, own))
@@ -144,17 +144,17 @@ def test_what_is_counted_is_what_is_multiplied() -> None:
 @settings(max_examples=25)
 @given(seed=seeds, n=st.integers(1, 30), existing=st.integers(0, 3), data=st.data())
 def test_any_shards_have_the_bits_of_the_whole(seed: int, n: int, existing: int, data: st.DataObject) -> None:
-    sighting, P = random_sighting(seed, n, existing)
-    seen = idp.see(sighting)
-    m = sighting.width
-    whole = minimal.covariance(P, sighting, seen).P
-    parts = minimal.FeatureRows(sighting, seen)
+    observations, P = random_observations(seed, n, existing)
+    seen = idp.see(observations)
+    m = observations.width
+    whole = minimal.covariance(P, observations, seen).P
+    parts = minimal.FeatureRows(observations, seen)
     cuts = sorted({0, n, *data.draw(st.lists(st.integers(0, n), max_size=4))})
     for first, last in pairwise(cuts):
         out = np.full((6 * (last - first), m + 6 * n), np.nan)
         parts.rows(first, last, out)
         assert out.tobytes() == whole[m + 6 * first : m + 6 * last].tobytes()
-        half = minimal.FeatureRows(sighting, seen, first).half(first, last)
+        half = minimal.FeatureRows(observations, seen, first).half(first, last)
         assert half.cross.tobytes() == np.ascontiguousarray(out[:, :m]).tobytes()
         at = 0
         for i in range(first, last):
@@ -163,15 +163,15 @@ def test_any_shards_have_the_bits_of_the_whole(seed: int, n: int, existing: int,
             at += 6 * width
             np.testing.assert_array_equal(block, out[6 * (i - first) : 6 * (i - first) + 6, m + 6 * i :])
         assert at == half.blocks.size
-        factored = minimal.covariance_factors(sighting, seen, first, last)
-        assert factored.own.tobytes() == minimal.covariance_factors(sighting, seen).own[first:last].tobytes()
+        factored = minimal.covariance_factors(observations, seen, first, last)
+        assert factored.own.tobytes() == minimal.covariance_factors(observations, seen).own[first:last].tobytes()
 
 
 @settings(max_examples=25)
 @given(seed=seeds, n=st.integers(1, 20), existing=st.integers(0, 6))
 def test_p_is_symmetric_to_the_bit_and_positive_semidefinite(seed: int, n: int, existing: int) -> None:
-    sighting, P = random_sighting(seed, n, existing)
-    after = minimal.covariance(P, sighting, idp.see(sighting)).P
+    observations, P = random_observations(seed, n, existing)
+    after = minimal.covariance(P, observations, idp.see(observations)).P
     assert np.array_equal(after, after.T)
     values = np.linalg.eigvalsh(after)
     assert values[0] >= -1e-13 * values[-1]
@@ -181,12 +181,12 @@ def test_p_is_symmetric_to_the_bit_and_positive_semidefinite(seed: int, n: int, 
 
 def test_the_factored_form_has_o_of_n_numbers_and_gives_every_block() -> None:
     n, existing = 20, 4
-    sighting, P = random_sighting(11, n, existing)
-    seen = idp.see(sighting)
-    found = minimal.covariance_factors(sighting, seen)
+    observations, P = random_observations(11, n, existing)
+    seen = idp.see(observations)
+    found = minimal.covariance_factors(observations, seen)
     numbers = sum(array.size for array in found[:4])
-    assert numbers == 6 * sighting.width + 9 + 7 * n
-    whole = minimal.covariance(P, sighting, seen).P
+    assert numbers == 6 * observations.width + 9 + 7 * n
+    whole = minimal.covariance(P, observations, seen).P
     for i, k in [(0, 0), (3, 17), (17, 3), (19, 19)]:
         G_i, G_k = turned(found.turn[i]), turned(found.turn[k])
         block = np.zeros((6, 6))
@@ -195,8 +195,8 @@ def test_the_factored_form_has_o_of_n_numbers_and_gives_every_block() -> None:
         block[3:5, 3:5] = G_i @ found.S @ G_k.T
         if i == k:
             block[3:5, 3:5] += found.own[i][[[0, 1], [1, 2]]]
-            block[5, 5] = sighting.sigma_rho**2
-        m = sighting.width
+            block[5, 5] = observations.sigma_rho**2
+        m = observations.width
         np.testing.assert_allclose(block, whole[m + 6 * i :, m + 6 * k :][:6, :6], atol=1e-14)
 
 
@@ -208,20 +208,28 @@ def turned(turn: np.ndarray) -> np.ndarray:
 def test_monte_carlo_agrees_with_the_predicted_covariance_of_the_ray() -> None:
     """20,000 initializations of one feature with the noise that P and Padd describe."""
     rng = np.random.default_rng(12)
-    sighting, P = random_sighting(12, 1)
+    observations, P = random_observations(12, 1)
     P = 1e-4 * P  # small enough that the feature is linear in its causes
-    sighting = Sighting(sighting.camera, sighting.state, P[:13], sighting.pixels, sighting.rho, sighting.sigma_rho, 0.5)
-    predicted = minimal.covariance(P, sighting, idp.see(sighting)).P[-6:, -6:][3:5, 3:5]
+    observations = Observations(
+        observations.camera,
+        observations.state,
+        P[:13],
+        observations.pixels,
+        observations.rho,
+        observations.sigma_rho,
+        0.5,
+    )
+    predicted = minimal.covariance(P, observations, idp.see(observations)).P[-6:, -6:][3:5, 3:5]
     count = 20_000
-    states = rng.multivariate_normal(sighting.state, P, count)
-    pixels = sighting.pixels + 0.5 * rng.normal(size=(count, 2))
+    states = rng.multivariate_normal(observations.state, P, count)
+    pixels = observations.pixels + 0.5 * rng.normal(size=(count, 2))
     drawn = np.array(
         [
-            idp.see(Sighting(sighting.camera, state, P[:13], uv[None])).y[0, 3:5]
+            idp.see(Observations(observations.camera, state, P[:13], uv[None])).y[0, 3:5]
             for state, uv in zip(states, pixels, strict=True)
         ]
     )
-    centred = drawn - idp.see(sighting).y[0, 3:5]
+    centred = drawn - idp.see(observations).y[0, 3:5]
     # Whitened by the prediction, the sample covariance of N draws is I within a few times √(2/N).
     white = np.linalg.solve(np.linalg.cholesky(predicted), centred.T)
     sampled = white @ white.T / count

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from naive import dense_idp
-from naive.random_sightings import CAMERAS, random_sighting, random_state
+from naive.random_cameras import CAMERAS, random_observations, random_state
 
 from factorbus import idp
 from factorbus.idp import predict
 from factorbus.idp.kernels import layout as at
-from factorbus.proto.features import BadPixel, BadState, Sighting
+from factorbus.proto.features import BadPixel, BadState, Observations
 from factorbus.proto.problems import BadShape, Problem
 
 seeds = st.integers(0, 2**32 - 1)
@@ -20,31 +20,31 @@ seeds = st.integers(0, 2**32 - 1)
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_features_and_their_jacobians_are_those_of_the_dense_twin(camera: str) -> None:
-    sighting, _ = random_sighting(1, 6, camera=camera)
-    seen = idp.see(sighting)
-    A, B = idp.jacobians(sighting, seen)
-    for k, uv in enumerate(sighting.pixels):
+    observations, _ = random_observations(1, 6, camera=camera)
+    seen = idp.see(observations)
+    A, B = idp.jacobians(observations, seen)
+    for k, uv in enumerate(observations.pixels):
 
         def by_state(x: np.ndarray, uv: np.ndarray = uv) -> np.ndarray:
-            return dense_idp.feature(sighting.camera, x, uv, sighting.rho)
+            return dense_idp.feature(observations.camera, x, uv, observations.rho)
 
         def by_pixel(h: np.ndarray) -> np.ndarray:
-            return dense_idp.feature(sighting.camera, sighting.state, h[:2], h[2])
+            return dense_idp.feature(observations.camera, observations.state, h[:2], h[2])
 
-        np.testing.assert_allclose(seen.y[k], by_state(sighting.state), atol=1e-12)
-        np.testing.assert_allclose(A[k], dense_idp.slope(by_state, sighting.state), atol=2e-10)
+        np.testing.assert_allclose(seen.y[k], by_state(observations.state), atol=1e-12)
+        np.testing.assert_allclose(A[k], dense_idp.slope(by_state, observations.state), atol=2e-10)
         np.testing.assert_allclose(
-            B[k], dense_idp.slope(by_pixel, np.append(uv, sighting.rho), h=0.05), rtol=1e-7, atol=1e-10
+            B[k], dense_idp.slope(by_pixel, np.append(uv, observations.rho), h=0.05), rtol=1e-7, atol=1e-10
         )
 
 
 @given(seed=seeds)
 def test_azimuth_and_elevation_do_not_change_with_the_quaternion_s_length(seed: int) -> None:
-    sighting, _ = random_sighting(seed, 1)
-    seen = idp.see(sighting)
-    longer = sighting.state.copy()
+    observations, _ = random_observations(seed, 1)
+    seen = idp.see(observations)
+    longer = observations.state.copy()
     longer[3:7] *= 3.0
-    again = replace(sighting, state=longer)
+    again = replace(observations, state=longer)
     np.testing.assert_allclose(idp.see(again).y[:, 3:5], seen.y[:, 3:5], atol=1e-13)
     A, _ = idp.jacobians(again, idp.see(again))
     np.testing.assert_allclose(A[0, 3:5, 3:7] @ longer[3:7], 0.0, atol=1e-12 * abs(A).max())
@@ -54,48 +54,48 @@ def test_azimuth_and_elevation_do_not_change_with_the_quaternion_s_length(seed: 
 def test_predicted_pixels_and_their_jacobians_are_those_of_the_dense_twin(camera: str) -> None:
     """Features seen from one place, looked at from another near by."""
     rng = np.random.default_rng(2)
-    sighting, _ = random_sighting(2, 6, camera=camera)
-    y = idp.see(sighting).y
+    observations, _ = random_observations(2, 6, camera=camera)
+    y = idp.see(observations).y
     y[:, 5] = rng.uniform(0.2, 0.6, 6)
-    state = sighting.state + 0.03 * rng.normal(size=13)
-    found = predict.predict(sighting.camera, state, y)
+    state = observations.state + 0.03 * rng.normal(size=13)
+    found = predict.predict(observations.camera, state, y)
     for k in np.flatnonzero(found.status == at.GOOD):
         np.testing.assert_allclose(
-            found.pixels[k], dense_idp.observed(sighting.camera, state, y[k]), rtol=1e-11, atol=1e-9
+            found.pixels[k], dense_idp.observed(observations.camera, state, y[k]), rtol=1e-11, atol=1e-9
         )
-        slope = dense_idp.slope(lambda x, k=k: dense_idp.observed(sighting.camera, x, y[k]), state)
+        slope = dense_idp.slope(lambda x, k=k: dense_idp.observed(observations.camera, x, y[k]), state)
         np.testing.assert_allclose(found.by_state[k], slope, rtol=1e-7, atol=1e-5)
-        slope = dense_idp.slope(lambda f: dense_idp.observed(sighting.camera, state, f), y[k])
+        slope = dense_idp.slope(lambda f: dense_idp.observed(observations.camera, state, f), y[k])
         np.testing.assert_allclose(found.by_feature[k], slope, rtol=1e-7, atol=1e-5)
     assert (found.status == at.GOOD).sum() >= 4
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_new_feature_is_predicted_at_its_own_pixel_whatever_its_depth(camera: str) -> None:
-    sighting, _ = random_sighting(3, 50, camera=camera)
-    y = idp.see(sighting).y
+    observations, _ = random_observations(3, 50, camera=camera)
+    y = idp.see(observations).y
     for rho in (1e-9, 0.0, 0.1, 10.0):
         y[:, 5] = rho
         np.testing.assert_allclose(
-            predict.predict(sighting.camera, sighting.state, y).pixels, sighting.pixels, atol=1e-9
+            predict.predict(observations.camera, observations.state, y).pixels, observations.pixels, atol=1e-9
         )
 
 
 def test_a_feature_behind_the_camera_is_told() -> None:
-    sighting, _ = random_sighting(4, 1, camera="pinhole")
-    y = idp.see(sighting).y
+    observations, _ = random_observations(4, 1, camera="pinhole")
+    y = idp.see(observations).y
     y[0, 5] = 0.5
-    passed = sighting.state.copy()
+    passed = observations.state.copy()
     passed[:3] += 3 * (dense_idp.point(y[0]) - passed[:3])
-    found = predict.predict(sighting.camera, passed, y)
+    found = predict.predict(observations.camera, passed, y)
     assert found.status.tolist() == [at.BEHIND]
     assert set(found.status.tolist()) <= set(predict.REASONS)
 
 
 def test_points_their_covariance_and_linearity_are_those_of_the_dense_twin() -> None:
     rng = np.random.default_rng(5)
-    sighting, _ = random_sighting(5, 8)
-    y = idp.see(sighting).y
+    observations, _ = random_observations(5, 8)
+    y = idp.see(observations).y
     y[:, 5] = rng.uniform(0.1, 2.0, 8)
     roots = 0.01 * rng.normal(size=(8, 6, 6))
     P = roots @ roots.transpose(0, 2, 1)
@@ -112,24 +112,24 @@ def test_points_their_covariance_and_linearity_are_those_of_the_dense_twin() -> 
         assert found.linearity[k] == pytest.approx(wanted, rel=1e-12)
 
 
-def looking_down() -> Sighting:
+def looking_down() -> Observations:
     """The camera's axis along the world's y: the ray of the principal point is vertical."""
-    sighting, _ = random_sighting(6, 3, camera="pinhole")
-    state = sighting.state.copy()
+    observations, _ = random_observations(6, 3, camera="pinhole")
+    state = observations.state.copy()
     state[3:7] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
     pixels = np.array([[10.0, 10.0], [320.0, 240.0], [30.0, 40.0]])
-    return replace(sighting, state=state, pixels=pixels)
+    return replace(observations, state=state, pixels=pixels)
 
 
 @pytest.mark.parametrize(
     ("pixel", "reason"), [((np.nan, 1.0), "finite"), ((-5.0, 10.0), "outside the image"), ((10.0, 240.0), "image")]
 )
-def test_one_bad_pixel_refuses_the_whole_sighting(pixel: tuple[float, float], reason: str) -> None:
-    sighting, _ = random_sighting(7, 4)
-    pixels = sighting.pixels.copy()
+def test_one_bad_pixel_refuses_the_whole_question(pixel: tuple[float, float], reason: str) -> None:
+    observations, _ = random_observations(7, 4)
+    pixels = observations.pixels.copy()
     pixels[2] = pixel
     with pytest.raises(BadPixel, match=reason) as refused:
-        idp.see(replace(sighting, pixels=pixels))
+        idp.see(replace(observations, pixels=pixels))
     assert refused.value.detail["index"] == 2
 
 
@@ -139,7 +139,7 @@ def test_a_vertical_ray_has_no_azimuth_and_is_refused() -> None:
     assert refused.value.detail["index"] == 1
 
 
-SIGHTING, _P = random_sighting(8, 2)
+OBSERVATIONS, _P = random_observations(8, 2)
 
 
 @pytest.mark.parametrize(
@@ -159,11 +159,11 @@ SIGHTING, _P = random_sighting(8, 2)
         ({"sigma_pixel": -1.0}, BadState),
     ],
 )
-def test_a_sighting_that_cannot_be_is_refused_at_the_door(change: dict, wanted: type[Problem]) -> None:
+def test_observations_that_cannot_be_is_refused_at_the_door(change: dict, wanted: type[Problem]) -> None:
     with pytest.raises(wanted):
-        idp.see(replace(SIGHTING, **change))
+        idp.see(replace(OBSERVATIONS, **change))
 
 
 def test_no_pixels_are_no_features() -> None:
-    seen = idp.see(replace(SIGHTING, pixels=np.empty((0, 2))))
+    seen = idp.see(replace(OBSERVATIONS, pixels=np.empty((0, 2))))
     assert seen.y.shape == (0, 6)

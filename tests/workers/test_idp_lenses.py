@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive import dense_idp
-from naive.random_sightings import CAMERAS, random_pixels
+from naive.random_cameras import CAMERAS, random_pixels
 
 from factorbus.idp import lenses
 from factorbus.idp.kernels import layout as at

@@ -9,7 +9,7 @@ export const FLOATS = new Set([
 
 /** What is in a bin, by the name of its field. `distance` and `threshold` are bins in gated, floats in associated. */
 const COLUMNS = {
-  keys: "i64", others: "i64", dims: "i64", other_dims: "i64", landmarks: "i64", sightings: "i64", candidates: "i64",
+  keys: "i64", others: "i64", dims: "i64", other_dims: "i64", landmarks: "i64", observations: "i64", candidates: "i64",
   values: "f64", measured: "f64", information: "f64", scale: "f64", covariance: "f64", distance: "f64",
   threshold: "f64", gain: "f64", distances: "f64", numbers: "f64", state: "f64", pixels: "f64", y: "f64", rows: "f64",
   cross: "f64", blocks: "f64", turn: "f64", own: "f64", U: "f64", S: "f64",

@@ -11,7 +11,7 @@ from factorbus.client.bus import Bus, connect
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features, Growing
-from factorbus.client.filter_state import Factored, Grown
+from factorbus.client.filter_state import Factored, FilterState
 from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror
@@ -30,8 +30,8 @@ __all__ = [
     "Draft",
     "Factored",
     "Features",
+    "FilterState",
     "Growing",
-    "Grown",
     "KeyCollision",
     "Map",
     "MapRow",

@@ -25,7 +25,7 @@ from factorbus.client.arguments import checked_seconds, of_type
 from factorbus.client.changes import Changes, some_of
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features as SyncFeatures
-from factorbus.client.filter_state import Factored, Grown
+from factorbus.client.filter_state import Factored, FilterState
 from factorbus.client.key_numbers import Key
 from factorbus.client.map import Map as SyncMap
 from factorbus.client.map import MapRow
@@ -113,7 +113,7 @@ class Features:
     def __init__(self, front: SyncFeatures) -> None:
         self._front = front
 
-    async def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Grown:
+    async def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> FilterState:
         """State and covariance with a new feature for each pixel.  Raises as `factorbus.client.Features.grow`."""
         growing = await asyncio.to_thread(self._front.send, x, P, pixels, timeout_s)
         return await asyncio.to_thread(growing.result)

@@ -9,7 +9,14 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key
-from factorbus.client.uncertainty import UncertaintyQuestions, factors_of, matrix_of, paired, sightings, why_question
+from factorbus.client.uncertainty import (
+    UncertaintyQuestions,
+    association_question,
+    factors_of,
+    matrix_of,
+    paired,
+    why_question,
+)
 from factorbus.proto.arrays import F64
 from factorbus.proto.asking import Associated, Covariances, Gained, Gated, Why
 from factorbus.proto.messages import Batch, Factors
@@ -66,8 +73,8 @@ class Uncertainty:
         probability: float = 0.95,
         timeout_s: float | None = None,
     ) -> Associated:
-        """Which landmark each sighting from `pose` is of, jointly."""
-        ask = sightings(pose, kind, measured, information, landmarks, probability)
+        """Which landmark each observation from `pose` is of, jointly."""
+        ask = association_question(pose, kind, measured, information, landmarks, probability)
         return await asyncio.wrap_future(self._ask.associate(ask, timeout_s))
 
     async def why(self, key: Key | None = None, *, factor: int | None = None, timeout_s: float | None = None) -> Why:

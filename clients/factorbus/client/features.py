@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import checked_seconds
-from factorbus.client.filter_state import Factored, Grown, factored, grown
+from factorbus.client.filter_state import Factored, FilterState, augmented, factored
 from factorbus.client.link import Link
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.client.shared_memory_pool import SharedAllocation, SharedMemoryPool
@@ -24,7 +24,15 @@ from factorbus.client.versions import refuse_other_protocol
 from factorbus.proto import keys
 from factorbus.proto.arrays import F64
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import CAMERA_STATE, FEATURE, Ask, FeaturesAnswer, Sighting, answer_size, new_rows_size
+from factorbus.proto.features import (
+    CAMERA_STATE,
+    FEATURE,
+    Ask,
+    FeaturesAnswer,
+    Observations,
+    answer_size,
+    new_rows_size,
+)
 from factorbus.proto.features_codec import decode_answer, encode_ask
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadShape, Refused, TooLarge, Unavailable
@@ -72,7 +80,12 @@ class Features:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Grown:
+    @property
+    def shares_memory(self) -> bool:
+        """Whether the next large answer may come in shared memory: until one has shown that nobody there shares any."""
+        return self._shared
+
+    def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> FilterState:
         """State and covariance with a new feature for each pixel, and wait for them.
 
         x (m,), P (m, m): as they are.  pixels (n, 2): distorted, u v.
@@ -83,12 +96,12 @@ class Features:
     def send(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> "Growing":
         """The same without waiting: several may be on their way.  x and P must not be changed until `result`."""
         state, covariance = _matching(x, P)
-        sighting = self._sighting(state, covariance, pixels)
-        m, n = sighting.width, sighting.count
+        observations = self._observations(state, covariance, pixels)
+        m, n = observations.width, observations.count
         allocation = None
         if self._shared and new_rows_size(n, m) >= _SHARED_FROM_BYTES:
             allocation = self._pool.try_allocate(PAGE, (m + FEATURE * n, m + FEATURE * n), m)
-        ask = Ask(sighting, "rows", allocation.segment) if allocation else Ask(sighting, "half")
+        ask = Ask(observations, "rows", allocation.segment) if allocation else Ask(observations, "half")
         return Growing(self, state, covariance, ask, allocation, self._ask(ask, timeout_s))
 
     def factor(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Factored:
@@ -96,9 +109,9 @@ class Features:
 
         Of P, its first 13 rows will do.  Raises as `grow`.
         """
-        sighting = self._sighting(np.asarray(x, np.float64), np.asarray(P, np.float64), pixels)
-        answer: FeaturesAnswer = self._ask(Ask(sighting, "factored"), timeout_s).future.result()
-        return factored(sighting, answer)
+        observations = self._observations(np.asarray(x, np.float64), np.asarray(P, np.float64), pixels)
+        answer: FeaturesAnswer = self._ask(Ask(observations, "factored"), timeout_s).future.result()
+        return factored(observations, answer)
 
     def close(self) -> None:
         """Ask nothing more."""
@@ -113,16 +126,16 @@ class Features:
     def again_without_memory(self, ask: Ask, timeout_s: float | None = None) -> Request:
         """For Growing: the same question, for somebody who shares no memory with us."""
         self._shared = False
-        return self._ask(Ask(ask.sighting, "half"), timeout_s)
+        return self._ask(Ask(ask.observations, "half"), timeout_s)
 
-    def _sighting(self, x: F64, P: F64, pixels: ArrayLike) -> Sighting:
+    def _observations(self, x: F64, P: F64, pixels: ArrayLike) -> Observations:
         seen = np.asarray(pixels, np.float64)
         if seen.ndim != 2 or seen.shape[1] != 2:
             raise BadShape("pixels", " × ".join(map(str, seen.shape)), "n × 2")
         if x.ndim != 1 or x.size < CAMERA_STATE or P.ndim != 2 or P.shape[0] < CAMERA_STATE or P.shape[1] != x.size:
             raise BadShape("x and P", f"{x.shape} and {P.shape}", "(m,) and (m, m) with m ≥ 13, the camera first")
         state, rows = x[:CAMERA_STATE], P[:CAMERA_STATE]
-        return Sighting(self.camera, state, rows, seen, self.rho, self.sigma_rho, self.sigma_pixel)
+        return Observations(self.camera, state, rows, seen, self.rho, self.sigma_rho, self.sigma_pixel)
 
     def _ask(self, ask: Ask, timeout_s: float | None) -> Request:
         self._link.check_open("features")
@@ -134,7 +147,7 @@ class Features:
         started = time.monotonic()
         service = self._service or self._any_service(timeout_s)
         left = max(0.001, timeout_s - (time.monotonic() - started))
-        what = f"service {service}, asked for {counted(ask.sighting.count, 'feature')},"
+        what = f"service {service}, asked for {counted(ask.observations.count, 'feature')},"
         return self._sender.carry(Request(what, keys.features_key(service), encode_ask(ask), decode_answer, left))
 
     def _any_service(self, timeout_s: float) -> str:
@@ -161,20 +174,20 @@ class Growing:
     ) -> None:
         self._features, self._x, self._P, self._ask, self._allocation = features, x, P, ask, allocation
         self._request = request
-        self._result: Grown | None = None
+        self._result: FilterState | None = None
 
     @property
     def future(self) -> Future[FeaturesAnswer]:
         """For callbacks and asyncio: it is done when `result` need not wait for the bus."""
         return self._request.future
 
-    def result(self) -> Grown:
+    def result(self) -> FilterState:
         """Wait for it, and put it together on this thread.  Raises as `Features.grow`."""
         if self._result is None:
             self._result = self._put_together()
         return self._result
 
-    def _put_together(self) -> Grown:
+    def _put_together(self) -> FilterState:
         try:
             answer = self._request.future.result()
         except Refused as refused:
@@ -189,7 +202,7 @@ class Growing:
             self._settle(clean=False, stored=True)
             raise
         matrix = self._allocation.matrix if self._allocation else None
-        result = grown(self._x, self._P, self._ask.sighting, answer, matrix)
+        result = augmented(self._x, self._P, self._ask.observations, answer, matrix)
         stored = all(done.shard.stored for done in answer.shards)
         self._settle(clean=answer.clean and self._request.attempt == 1, stored=stored)
         return result

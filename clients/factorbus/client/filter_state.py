@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.proto.arrays import F64
-from factorbus.proto.features import FEATURE, Done, FeaturesAnswer, ShardDone, Sighting
+from factorbus.proto.features import FEATURE, Done, FeaturesAnswer, Observations, ShardDone
 from factorbus.proto.problems import BadMessage
 
 _TILE = 64 * FEATURE  # rows and columns transposed at a time
 
 
-class Grown(NamedTuple):
+class FilterState(NamedTuple):
     """A filter's state with new features.
 
     x (m + 6 n,): the new features last.  P (m + 6 n, m + 6 n): symmetric.  y (n, 6): the new features.
@@ -70,21 +70,21 @@ class Factored:
         return np.array([[a, 1.0, b], [c, 0.0, -d]])
 
 
-def factored(sighting: Sighting, answer: FeaturesAnswer) -> Factored:
+def factored(observations: Observations, answer: FeaturesAnswer) -> Factored:
     """An answer in the form `factored`.  Raises BadMessage."""
-    done = [each.shard for each in _in_order(answer, sighting.count)]
+    done = [each.shard for each in _in_order(answer, observations.count)]
     U, S = _there("U", done[0].U), _there("S", done[0].S)
     turn = np.concatenate([_there("turn", shard.turn) for shard in done])
     own = np.concatenate([_there("own", shard.own) for shard in done])
-    return Factored(np.concatenate([shard.y for shard in done]), U, S, turn, own, sighting.sigma_rho)
+    return Factored(np.concatenate([shard.y for shard in done]), U, S, turn, own, observations.sigma_rho)
 
 
-def grown(x: F64, P: F64, sighting: Sighting, answer: FeaturesAnswer, matrix: F64 | None) -> Grown:
+def augmented(x: F64, P: F64, observations: Observations, answer: FeaturesAnswer, matrix: F64 | None) -> FilterState:
     """State and covariance with the features of an answer in the form `rows` or `half`.  Raises BadMessage.
 
     matrix (m + 6 n, m + 6 n): where stored rows are, and everything else is put; None: nothing is stored.
     """
-    m, n = sighting.width, sighting.count
+    m, n = observations.width, observations.count
     done = _in_order(answer, n)
     if matrix is None:
         if any(each.shard.stored for each in done):
@@ -99,7 +99,7 @@ def grown(x: F64, P: F64, sighting: Sighting, answer: FeaturesAnswer, matrix: F6
         matrix[:m, left : left + _TILE] = matrix[left : left + _TILE, :m].T
     y = np.concatenate([each.shard.y for each in done])
     workers, seconds = tuple(each.worker for each in done), max(each.seconds for each in done)
-    return Grown(np.concatenate([x, y.reshape(-1)]), matrix, y, workers, seconds)
+    return FilterState(np.concatenate([x, y.reshape(-1)]), matrix, y, workers, seconds)
 
 
 def _place(shard: ShardDone, m: int, n: int, matrix: F64) -> None:

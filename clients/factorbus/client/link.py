@@ -214,7 +214,7 @@ def _config(endpoints: Sequence[str], settings: Mapping[str, Any], file: str) ->
     except zenoh.ZError as error:
         variable = _VARIABLE if os.environ.get(_VARIABLE) == file else ""
         raise BadConfigurationFile(file, redact.reason(error), variable) from None
-    for path, value in (_settings(endpoints) | dict(settings)).items():
+    for path, value in (session_settings(endpoints) | dict(settings)).items():
         try:
             config.insert_json5(path, json.dumps(value))
         except (zenoh.ZError, TypeError) as error:
@@ -222,7 +222,7 @@ def _config(endpoints: Sequence[str], settings: Mapping[str, Any], file: str) ->
     return config
 
 
-def _settings(endpoints: Sequence[str]) -> dict[str, Any]:
+def session_settings(endpoints: Sequence[str]) -> dict[str, Any]:
     return {
         "mode": "client",
         "connect/endpoints": list(endpoints),

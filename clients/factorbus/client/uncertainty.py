@@ -76,7 +76,7 @@ class UncertaintyQuestions:
         return self._ask("associate", question, asking_codec.decode_associated, timeout_s)
 
     def why(self, ask: AskWhy, timeout_s: float | None) -> Future[Why]:
-        """The account of a variable or a factor."""
+        """What holds a variable or a factor."""
         return self._ask("why", asking_codec.encode_ask_why(ask), asking_codec.decode_why, timeout_s)
 
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
@@ -135,13 +135,13 @@ class Uncertainty:
         probability: float = 0.95,
         timeout_s: float | None = None,
     ) -> Associated:
-        """Which landmark each sighting from `pose` is of, jointly.
+        """Which landmark each observation from `pose` is of, jointly.
 
         kind: "landmark_se2", "landmark_se3" or "bearing_range_se2".  measured (n, size).  information: as in a draft, a
         matrix or its upper triangle, for all of them, or a row for each.  landmarks: to choose from; None: all there
         are.  Raises BadShape.
         """
-        ask = sightings(pose, kind, measured, information, landmarks, probability)
+        ask = association_question(pose, kind, measured, information, landmarks, probability)
         return self.ask.associate(ask, timeout_s).result()
 
     def why(self, key: Key | None = None, *, factor: int | None = None, timeout_s: float | None = None) -> Why:
@@ -190,7 +190,7 @@ def why_question(key: Key | None, factor: int | None) -> AskWhy:
     return AskWhy(None if key is None else key_number(key), None if ids is None else int(ids[0]))
 
 
-def sightings(
+def association_question(
     pose: Key,
     kind: str,
     measured: ArrayLike,
@@ -198,7 +198,7 @@ def sightings(
     landmarks: Sequence[Key] | Key | None,
     probability: float,
 ) -> AskAssociate:
-    """The question, with the information of every sighting.  Raises BadShape."""
+    """The question, with the information of every observation.  Raises BadShape."""
     known = FACTOR_KINDS.get(kind) if isinstance(kind, str) else None
     if known is None:
         raise BadShape("kind", repr(kind), "landmark_se2, landmark_se3 or bearing_range_se2")

@@ -33,7 +33,7 @@ class Source:
 class Dataset:
     """One data set in the converted form: g2o text, edges in time order.
 
-    paper: its name in the paper of 2013, "" where it is not one of the paper's six.  edges: pose to pose; sightings:
+    paper: its name in the paper of 2013, "" where it is not one of the paper's six.  edges: pose to pose; observations:
     pose to landmark.  vertices: number of vertex lines.  optimum: the lowest χ² = Σ rᵀΩr known, g2o residuals,
     vertex 0 fixed.  download: the public source; wheel: a file of the gtsam wheel from which the same bytes come.
     near: a file that is like this one but not the same, and why it will not do.
@@ -46,7 +46,7 @@ class Dataset:
     poses: int
     landmarks: int
     edges: int
-    sightings: int
+    observations: int
     vertices: int
     optimum: float
     sha256: str

@@ -69,7 +69,7 @@ def estimate(snapshot: Snapshot) -> dict[str, Any]:
 
 
 def plain(report: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a step's account is words and numbers that JSON has."""
+    """What of a step's report is words and numbers that JSON has."""
     return {k: v for k, v in report.items() if isinstance(v, (str, bool, int)) or _is_finite(v)}
 
 

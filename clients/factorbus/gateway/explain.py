@@ -1,4 +1,4 @@
-"""What holds a variable where it is: the service's own account of it (`ask/why`), and the same in words."""
+"""What holds a variable where it is: the service's own explanation of it (`ask/why`), and the same in words."""
 
 import math
 from collections.abc import Mapping
@@ -28,21 +28,21 @@ def explain(why: Why) -> dict[str, Any]:
     1 where the information is right; known: the share of what it measures that is known from it and not from the
     others; without: by how much χ² would fall without it, to first order; null: nothing else measures it.
     """
-    account = why.variable
-    rows = sorted(map(_row, account["factors"]), key=lambda row: -row["chi2"])
-    name = format_symbol(account["key"])
+    explained = why.variable
+    rows = sorted(map(_row, explained["factors"]), key=lambda row: -row["chi2"])
+    name = format_symbol(explained["key"])
     return {
         "key": name,
-        "kind": account["kind"],
-        "value": account["value"],
-        "fixed": account["fixed"],
+        "kind": explained["kind"],
+        "value": explained["value"],
+        "fixed": explained["fixed"],
         "revision": why.revision,
-        "sigmas": account["sigmas"],
-        "conditioning": account["conditioning"],
+        "sigmas": explained["sigmas"],
+        "conditioning": explained["conditioning"],
         "chi2": sum(row["rho"] for row in rows),
         "factors": rows,
         "step": f"{why.step['strategy']}: {why.step['because']}" if why.step else "",
-        "text": _text(name, account, rows, why.step),
+        "text": _text(name, explained, rows, why.step),
     }
 
 
@@ -61,26 +61,26 @@ def _row(factor: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _text(name: str, account: Mapping[str, Any], rows: list[dict[str, Any]], step: Mapping[str, Any]) -> str:
+def _text(name: str, explained: Mapping[str, Any], rows: list[dict[str, Any]], step: Mapping[str, Any]) -> str:
     """In a sentence or four."""
-    what = f"{name} is {_WORDS.get(account['kind'], 'of kind ' + account['kind'])}"
-    if account["fixed"]:
+    what = f"{name} is {_WORDS.get(explained['kind'], 'of kind ' + explained['kind'])}"
+    if explained["fixed"]:
         return f"{what}, and fixed: it is not estimated. {_leading(len(rows))}"
     if not rows:
         return f"{what}, and no factor holds it."
     others = sorted({key for row in rows for key in row["keys"]} - {name})
     held = f"{what}, held by {counted(len(rows), 'factor')}"
     held += f" to {', '.join(others[:4])}{' and others' if len(others) > 4 else ''}." if others else "."
-    return f"{held} {_certainty(account)}{_fit(rows[0], step)}"
+    return f"{held} {_certainty(explained)}{_fit(rows[0], step)}"
 
 
 def _leading(count: int) -> str:
     return f"{counted(count, 'factor')} {'leads' if count == 1 else 'lead'} away from it."
 
 
-def _certainty(account: Mapping[str, Any]) -> str:
+def _certainty(explained: Mapping[str, Any]) -> str:
     """How well it is known, where its tangent is metres and radians."""
-    sigmas, kind = account["sigmas"], account["kind"]
+    sigmas, kind = explained["sigmas"], explained["kind"]
     if kind not in _WORDS or kind == "idp":
         return ""
     places, turns = (sigmas[:2], sigmas[2:]) if kind in ("se2", "point2") else (sigmas[:3], sigmas[3:])

@@ -1,7 +1,7 @@
 """From what a robot says to what goes into the map.  No bus and no clock: messages in, drafts out.
 
-Odometry makes keyframes, which have its time stamp, and the factors between them.  A pose or a sighting belongs to the
-last keyframe before it: it is carried there by odometry, and what that adds to its covariance is added.  What is
+Odometry makes keyframes, which have its time stamp, and the factors between them.  A pose or an observation belongs to
+the last keyframe before it: it is carried there by odometry, and what that adds to its covariance is added.  What is
 stamped later than the last odometry waits for the next.
 """
 
@@ -190,10 +190,10 @@ class FrontEnd:
     def _use_detections(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
         place = self._track.try_place(stamp_ns)
         if place is None:
-            raise BadRosMessage(topic, "sightings from before the first keyframe", "some from after it")
+            raise BadRosMessage(topic, "observations from before the first keyframe", "some from after it")
         way = self._floored_way(place)
         # All are looked at before one is used: a message is used whole or not at all.
-        seen = [self._sighting(topic, message, each, place, way) for each in message.detections]
+        seen = [self._observation(topic, message, each, place, way) for each in message.detections]
         for key, measured, weight in seen:
             if key not in self._landmarks:
                 self._landmarks.add(key)
@@ -201,7 +201,7 @@ class FrontEnd:
             kind = f"landmark_{self._space.pose}"
             draft.factor(kind, (place.keyframe.key, key), measured, information=weight)
 
-    def _sighting(self, topic: str, message: Any, seen: Any, place: KeyframePlace, way: F64) -> tuple[int, F64, F64]:
+    def _observation(self, topic: str, message: Any, seen: Any, place: KeyframePlace, way: F64) -> tuple[int, F64, F64]:
         """Key of the landmark, where it is from the keyframe, and the information of that.
 
         q = T p', p' = R p + t with T the keyframe's way, (R, t) the mount: Σ_q = R_q Σ_p R_qᵀ + J Σ_T Jᵀ with
@@ -252,7 +252,7 @@ class FrontEnd:
             return Transform(np.eye(3), np.zeros(3))
         if frame not in self._settings.mounts:
             wanted = f"{self.base_frame!r}, or where that frame is on the robot: --mount {frame}=x,y,z,qx,qy,qz,qw"
-            raise BadRosMessage(topic, f"sightings in frame {frame!r}", wanted)
+            raise BadRosMessage(topic, f"observations in frame {frame!r}", wanted)
         return self._settings.mounts[frame]
 
     def _transform(self, topic: str, pose: Any) -> Transform:

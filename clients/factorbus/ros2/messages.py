@@ -1,8 +1,8 @@
 """The ROS messages that are used: their type hashes, and CDR to objects and back, by rosbags.
 
-Landmarks come as vision_msgs/Detection3DArray: of the messages in common use it is the one that has for each sighting
-an identity, a position in metres and a covariance (AprilTag's own message has corners in pixels; markers are for
-drawing).  It is in no type store, so its definition stands here, as it is since ROS 2 Humble.
+Landmarks come as vision_msgs/Detection3DArray: of the messages in common use it is the one that has for each
+observation an identity, a position in metres and a covariance (AprilTag's own message has corners in pixels; markers
+are for drawing).  It is in no type store, so its definition stands here, as it is since ROS 2 Humble.
 """
 
 import struct

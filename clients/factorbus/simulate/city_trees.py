@@ -1,4 +1,4 @@
-"""A town with a tree in some of its blocks, driven with odometry and sightings of the trees."""
+"""A town with a tree in some of its blocks, driven with odometry and observations of the trees."""
 
 import math
 from collections.abc import Iterator
@@ -60,10 +60,10 @@ def city_trees(
     tree_share: float = 0.2,
     block_m: int = 5,
 ) -> Iterator[Step]:
-    """A drive past trees: `se2` poses a metre apart with `between_se2` odometry, `point2` trees, and sightings.
+    """A drive past trees: `se2` poses a metre apart with `between_se2` odometry, `point2` trees, and observations.
 
     tree_share: the share of blocks with a tree.  Without arguments, densities and noise are like those of the
-    citytrees10000 data set, with somewhat more sightings.  Raises BadParameter.
+    citytrees10000 data set, with somewhat more observations.  Raises BadParameter.
     """
     checked_run(poses, seed)
     checked_sigma("sigma_xy_m", sigma_xy_m)
@@ -90,12 +90,12 @@ def _blocks(
         pairs = POSE + np.stack([numbers - 1, numbers], axis=1)
         ends = np.arange(len(block)) + (len(z) == len(block))
         edges = FactorBlock("between_se2", pairs, z, diagonal_information(odometry, len(z)), ends)
-        sightings, points = _sightings(trees, rng, first, block, truth, sensor)
-        yield from steps_of("se2", first, truth, [edges, sightings], points)
+        observations, points = _observations(trees, rng, first, block, truth, sensor)
+        yield from steps_of("se2", first, truth, [edges, observations], points)
         first, before = first + len(block), truth[-1:]
 
 
-def _sightings(
+def _observations(
     trees: "_Trees", rng: np.random.Generator, first: int, block: list[GridPose], truth: F64, sensor: TreeSensor
 ) -> tuple[FactorBlock, PointBlock]:
     known = trees.count
@@ -130,7 +130,7 @@ class _Trees:
 
     def __init__(self, seed: int, share: float, sensor: TreeSensor, block: int) -> None:
         self._seed, self._share, self._sensor, self._block = seed, share, sensor, block
-        self._chance = Random(f"sightings {seed}")
+        self._chance = Random(f"sightings {seed}")  # a seed: another text is another town
         self._planted: dict[tuple[int, int], tuple[float, float] | None] = {}
         self._numbers: dict[tuple[int, int], int] = {}
 

@@ -41,10 +41,10 @@ def blocks_of(answer: Covariances) -> Mapping[int, F64]:
 class MapCertainty:
     """How certain `joined` is of at most about `most` poses and as many points.  For the thread that looks."""
 
-    def __init__(self, joined: Map, most: int, told: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, joined: Map, most: int, notify: Callable[[], None] = lambda: None) -> None:
         self._map, self._most = joined, most
         self._variables: Sequence[Variables] = ()
-        self._rate_limited = RateLimited(self._ask, _NOBODY, told)
+        self._rate_limited = RateLimited(self._ask, _NOBODY, notify)
 
     def spread(self, epoch: int, revision: int, variables: Sequence[Variables]) -> Spread:
         """Around where things are in that revision, by the newest covariances there are; never waits."""

@@ -131,7 +131,7 @@ class LiveView:
         if look.spread is not None:
             everything = track.places if len(track.keys) else points.places
             rings = outlines(look.spread, view_of(everything)) if len(look.spread.keys) else np.empty((0, 2, 3))
-            self._log_lines("map/where_it_may_be", rings, _rgb(style.DOUBT), _THIN)
+            self._log_lines("map/where_it_may_be", rings, _rgb(style.UNCERTAINTY), _THIN)
 
     def _log_lines(self, path: str, lines: F64, colours: object, width: Any = _LINE) -> None:
         """Line strips (n, corners, 2 or 3)."""

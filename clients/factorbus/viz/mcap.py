@@ -5,7 +5,7 @@
 | /tf | foxglove.FrameTransform | map → robot: the pose with the largest key, one for each letter, at its time stamp |
 | /map/scene | foxglove.SceneUpdate | trajectory, landmarks, loop closures coloured by how badly they fit |
 | /map/poses | foxglove.PosesInFrame | all poses |
-| /map/step | factorbus.Step, JSON | the account of each step, for plots: chi2, step_ms, eliminated, … |
+| /map/step | factorbus.Step, JSON | the report of each step, for plots: chi2, step_ms, eliminated, … |
 | /map/delta | factorbus.Delta, JSON | each delta, whole: variables by kind, keys, values and time stamps |
 | /map/factors | factorbus.Factors, JSON | factors when they were first seen, by kind: keys, measured, information |
 

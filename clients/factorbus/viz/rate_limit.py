@@ -15,11 +15,11 @@ _LEAST_PAUSE_S = 0.5
 class RateLimited(Generic[T]):
     """The last answer to a question that is put again when it is out of date.  For one thread.
 
-    ask: puts the question and returns at once.  told: called, on any thread, when an answer has come.
+    ask: puts the question and returns at once.  notify: called, on any thread, when an answer has come.
     """
 
-    def __init__(self, ask: Callable[[], Future[T]], first: T, told: Callable[[], None] = lambda: None) -> None:
-        self._ask, self._told = ask, told
+    def __init__(self, ask: Callable[[], Future[T]], first: T, notify: Callable[[], None] = lambda: None) -> None:
+        self._ask, self._notify = ask, notify
         self._asked: Future[T] | None = None
         self._asked_at, self._next_at = 0.0, 0.0
         self.answer = first
@@ -38,5 +38,5 @@ class RateLimited(Generic[T]):
                 self.answer = asked.result()
         if self._asked is None and now >= self._next_at and out_of_date(self.answer):
             self._asked, self._asked_at = self._ask(), now
-            self._asked.add_done_callback(lambda _: self._told())
+            self._asked.add_done_callback(lambda _: self._notify())
         return self.answer

@@ -8,7 +8,7 @@ TRUTH = "#9A9A9A"
 LOOPS = "#AA3377"
 POINTS = "#009E73"
 SPREAD = "#56B4E9"
-DOUBT = "#CC79A7"  # the same in live views, where sky blue is a loop closure that fits
+UNCERTAINTY = "#CC79A7"  # the same in live views, where sky blue is a loop closure that fits
 INK = "#222222"
 FAINT = "#E4E4E4"
 

@@ -61,7 +61,7 @@ def private_file(path: str, flags: int) -> int:
 
 def check_file(what: str, path: Path, status: os.stat_result) -> None:
     """Raises UnsafeFolder if somebody else may have written the file `path`; `status`: of its open descriptor."""
-    reason, mend = _why_unsafe_itself(path, status, groups=set())
+    reason, mend = why_unsafe_itself(path, status, groups=set())
     if reason:
         raise UnsafeFolder(what, path, reason, mend)
 
@@ -73,7 +73,7 @@ def why_unsafe(path: Path) -> tuple[str, str]:
     path = path.resolve()
     if _is_read_only(path):
         return "", ""
-    found = _why_unsafe_itself(path, path.stat(), _groups())
+    found = why_unsafe_itself(path, path.stat(), _groups())
     for above in path.parents:
         if found[0]:
             break
@@ -81,7 +81,7 @@ def why_unsafe(path: Path) -> tuple[str, str]:
     return found
 
 
-def _why_unsafe_itself(path: Path, status: os.stat_result, groups: set[int]) -> tuple[str, str]:
+def why_unsafe_itself(path: Path, status: os.stat_result, groups: set[int]) -> tuple[str, str]:
     if not hasattr(os, "geteuid"):
         return "", ""
     user, mode = os.geteuid(), stat.S_IMODE(status.st_mode)

@@ -108,7 +108,7 @@ class Gained:
 
 @dataclass(frozen=True, slots=True)
 class AskAssociate:
-    """Sightings from the pose `pose`, as of factors of `kind`: measured (n, size), information (n, r(r+1)/2).
+    """Observations from the pose `pose`, as of factors of `kind`: measured (n, size), information (n, r(r+1)/2).
 
     landmarks (k,): keys to choose from; None: all points of the map that the kind connects.
     """
@@ -123,11 +123,11 @@ class AskAssociate:
 
 @dataclass(frozen=True, slots=True)
 class Associated:
-    """Which landmark each sighting is of, in the largest set that is compatible jointly.
+    """Which landmark each observation is of, in the largest set that is compatible jointly.
 
     landmarks (n,): keys; matched (n,) bool: false: of none of them, and the key is 0.  distance: d² of the whole set,
     dims: of how many numbers, threshold: what it was allowed.  complete: false: the search was cut short.
-    sightings, candidates, distances (p,): all pairs compatible by themselves: index, key and d², nearest first.
+    observations, candidates, distances (p,): all pairs compatible by themselves: index, key and d², nearest first.
     """
 
     epoch: int
@@ -138,7 +138,7 @@ class Associated:
     dims: int
     threshold: float
     complete: bool
-    sightings: I64
+    observations: I64
     candidates: I64
     distances: F64
 
@@ -153,7 +153,7 @@ class AskWhy:
 
 @dataclass(frozen=True, slots=True)
 class Why:
-    """variable or factor: an account of it, the other is empty; step: the report of the map's last step.  Open maps.
+    """variable or factor: what holds it, the other is empty; step: the report of the map's last step.  Open maps.
 
     `str` of it is the same in words, with keys as they print (x12).
     """
@@ -166,7 +166,7 @@ class Why:
 
     @property
     def text(self) -> str:
-        """The account in words: what it is, how certain, and its factors, those that fit worst first."""
+        """The same in words: what it is, how certain, and its factors, those that fit worst first."""
         return why_text(self.revision, self.variable, self.factor, self.step)
 
     @property

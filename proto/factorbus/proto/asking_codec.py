@@ -33,7 +33,7 @@ from factorbus.wording import counted
 
 # Where quantiles of χ² are numbers that can be computed with.
 _SURE = (1e-12, 1.0 - 1e-12)
-_SIGHTS = ("landmark_se2", "landmark_se3", "bearing_range_se2")  # of a point, from a pose
+_LANDMARK_KINDS = ("landmark_se2", "landmark_se3", "bearing_range_se2")  # of a point, from a pose
 
 
 def encode_ask_covariance(ask: AskCovariance) -> bytes:
@@ -162,8 +162,8 @@ def decode_ask_associate(data: bytes, limits: MessageLimits = REQUEST_LIMITS) ->
     """The question that `data` is."""
     content = fields.read_map("question", data, limits)
     kind = fields.text("", content, "kind")
-    if kind not in _SIGHTS:
-        raise UnknownKind("question.kind", kind, _SIGHTS)
+    if kind not in _LANDMARK_KINDS:
+        raise UnknownKind("question.kind", kind, _LANDMARK_KINDS)
     size = FACTOR_KINDS[kind].size
     measured = _read_f8("question", content, "measured", None)
     if measured.size % size:
@@ -192,7 +192,7 @@ def encode_associated(message: Associated) -> bytes:
             "dims": message.dims,
             "threshold": message.threshold,
             "complete": message.complete,
-            "sightings": _i8(message.sightings),
+            "observations": _i8(message.observations),
             "candidates": _i8(message.candidates),
             "distances": _f8(message.distances),
         }
@@ -202,8 +202,8 @@ def encode_associated(message: Associated) -> bytes:
 def decode_associated(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Associated:
     """The answer to ask/associate that `data` is."""
     content = fields.read_map("associated", data, limits)
-    landmarks, sightings, candidates = (
-        np.asarray(_keys(content, name, needed=True)) for name in ("landmarks", "sightings", "candidates")
+    landmarks, observations, candidates = (
+        np.asarray(_keys(content, name, needed=True)) for name in ("landmarks", "observations", "candidates")
     )
     return Associated(
         *_when(content),
@@ -213,9 +213,9 @@ def decode_associated(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Ass
         fields.integer("", content, "dims"),
         fields.number("", content, "threshold"),
         fields.flag("", content, "complete"),
-        sightings,
+        observations,
         candidates,
-        _read_f8("", content, "distances", len(sightings)),
+        _read_f8("", content, "distances", len(observations)),
     )
 
 

@@ -74,7 +74,7 @@ class Camera:
         return (*self.numbers, *[0.0] * (len(names) - len(self.numbers)))[names.index(name)]
 
     def lens(self) -> tuple[float, ...]:
-        """The eleven numbers that a sight in a map carries (`factorbus.proto.kinds`):
+        """The eleven numbers that an observation in a map carries (`factorbus.proto.kinds`):
 
         code (0 radial, 1 radtan and pinhole, 2 fisheye), f_u f_v c_x c_y (pixels), limit (0: as far as the model is one
         to one), and five of the model: radtan k1 k2 p1 p2 k3, fisheye k1 k2 k3 k4 0, radial d_x d_y k1 k2 0.

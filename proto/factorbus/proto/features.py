@@ -40,7 +40,7 @@ class BadState(Problem):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
+class Observations:
     """Pixels seen for the first time, and what the filter knows of the camera that saw them.
 
     state (13,): x_v.  covariance (13, m): the camera's rows of P, of as many columns as the filter's state has numbers.
@@ -81,9 +81,9 @@ class Segment(NamedTuple):
 
 
 class Ask(NamedTuple):
-    """A filter front end's question: the features of `sighting`, in one of FORMS; rows into `segment` if given."""
+    """A filter front end's question: the features of `observations`, in one of FORMS; rows into `segment` if given."""
 
-    sighting: Sighting
+    observations: Observations
     form: str = "rows"
     segment: Segment | None = None
 
@@ -139,7 +139,7 @@ class FeaturesAnswer(NamedTuple):
 
 def answer_size(ask: Ask) -> int:
     """Bytes of the numbers in the answer to `ask`, beyond those that go to its segment."""
-    n, m = ask.sighting.count, ask.sighting.width
+    n, m = ask.observations.count, ask.observations.width
     if ask.form == "factored":
         return 8 * (13 * n + 6 * m + 9)
     if ask.form == "half":

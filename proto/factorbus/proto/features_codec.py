@@ -20,10 +20,10 @@ from factorbus.proto.features import (
     Ask,
     Done,
     FeaturesAnswer,
+    Observations,
     Segment,
     Shard,
     ShardDone,
-    Sighting,
 )
 from factorbus.proto.fields import F8, Map
 from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, MessageLimits
@@ -36,7 +36,7 @@ _OPTIONAL = ("rows", "cross", "blocks", "turn", "own", "U", "S")
 
 def encode_ask(message: Ask) -> bytes:
     """The bytes of a filter front end's question."""
-    seen, camera = message.sighting, message.sighting.camera
+    seen, camera = message.observations, message.observations.camera
     lens: dict[str, Any] = {"model": camera.model, "numbers": _column(camera.numbers)}
     if camera.width:
         lens |= {"width": camera.width, "height": camera.height}
@@ -59,7 +59,7 @@ def decode_ask(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> Ask:
     """The question that `data` is.  Raises BadMessage, BadCamera, TooLarge."""
     content = fields.read_map("ask", data, limits)
     form = fields.choice_of("", content, "form", FORMS, "rows")
-    sighting = Sighting(
+    observations = Observations(
         _camera(fields.mapping("", content, "camera")),
         _array(content, "state", CAMERA_STATE).reshape(-1)[:CAMERA_STATE],
         _array(content, "covariance", CAMERA_STATE).reshape(CAMERA_STATE, -1),
@@ -68,7 +68,7 @@ def decode_ask(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> Ask:
     )
     if len(content["state"]) != 8 * CAMERA_STATE:
         raise BadMessage("state", counted(len(content["state"]), "byte"), f"{8 * CAMERA_STATE} (13 float64)")
-    return Ask(sighting, form, _segment(content))
+    return Ask(observations, form, _segment(content))
 
 
 def encode_shard(message: Shard) -> bytes:

@@ -117,7 +117,7 @@ class Accepted:
     """The answer to an insert: from `revision` on the estimate includes it.
 
     first_factor: id of the insert's first factor; the others follow in the order of the message.
-    applied: inserts that this step took in together.  report: the step's account of work (see StepReport keys
+    applied: inserts that this step took in together.  report: the step's report of work (see StepReport keys
     in `proto/README.md`): strategy, because, chi2, iterations, step_ms, ...
     """
 

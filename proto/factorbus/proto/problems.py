@@ -6,13 +6,14 @@
     ├── BadEndpoint          bad_endpoint         an address on the bus that cannot be read
     ├── BadSetting           bad_setting          a setting of the connection that the bus does not take
     ├── BadConfigurationFile bad_file             a zenoh configuration file that cannot be read (client side)
-    ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
-    ├── NotFiniteNumbers     not_finite           a NaN or an infinity among numbers for a map (client side)
-    ├── BadInformation       bad_information      an asymmetric information matrix, sigmas that are not positive
-    ├── BadMessage           bad_message          bytes that are not the message they should be
-    │   ├── UnknownKind      unknown_kind         a kind of variable, factor or change that this version does not know
-    │   ├── BadLoss          bad_loss             a loss that does not exist, a scale that is not positive
-    │   └── BadOption        bad_option           a parameter whose value, or type, is not one it takes
+    ├── BadInput             (of those below)     something given that is not what is wanted at its place
+    │   ├── BadShape         bad_shape            numbers whose count does not fit their kind (client side)
+    │   ├── NotFiniteNumbers not_finite           a NaN or an infinity among numbers for a map (client side)
+    │   ├── BadInformation   bad_information      an asymmetric information matrix, sigmas that are not positive
+    │   └── BadMessage       bad_message          bytes that are not the message they should be
+    │       ├── UnknownKind  unknown_kind         a kind of variable, factor or change that this version does not know
+    │       ├── BadLoss      bad_loss             a loss that does not exist, a scale that is not positive
+    │       └── BadOption    bad_option           a parameter whose value, or type, is not one it takes
     ├── TooLarge             too_large            a message, an insert or a map over its limit
     ├── BadSequence          bad_sequence         a sequence number that skips or is too old to answer again
     ├── WrongEpoch           wrong_epoch          the map was restarted or recreated since the client joined
@@ -119,33 +120,30 @@ class BadConfigurationFile(Problem):
         super().__init__(f"the zenoh configuration {file}{named} cannot be read: {reason}", path=file)
 
 
-class BadShape(Problem):
-    code = "bad_shape"
+class BadInput(Problem):
+    """where: in what was given.  A kind of its own for each thing that a program would do about it."""
 
     def __init__(self, where: str, seen: object, wanted: str) -> None:
         super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
 
-class NotFiniteNumbers(Problem):
+class BadShape(BadInput):
+    code = "bad_shape"
+
+
+class NotFiniteNumbers(BadInput):
     code = "not_finite"
 
     def __init__(self, where: str, seen: object) -> None:
-        wanted = "finite numbers"
-        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
+        super().__init__(where, seen, "finite numbers")
 
 
-class BadInformation(Problem):
+class BadInformation(BadInput):
     code = "bad_information"
 
-    def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
-
-class BadMessage(Problem):
+class BadMessage(BadInput):
     code = "bad_message"
-
-    def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
 
 class BadLoss(BadMessage):

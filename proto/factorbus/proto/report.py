@@ -1,4 +1,4 @@
-"""A step's account of work, as it is in the answer to an insert and in a delta.  Explained in the contract, §4."""
+"""A step's report of work, as it is in the answer to an insert and in a delta.  Explained in the contract, §4."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""An answer of `ask/why` in words, for a person.  Of open accounts, what is not there is not said."""
+"""An answer of `ask/why` in words, for a person.  Of open maps, what is not there is not said."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any

@@ -18,7 +18,7 @@ from factorbus.idp import job
 from factorbus.proto import codec
 from factorbus.proto import features_codec as features
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import Ask, Segment, Shard, ShardDone, Sighting
+from factorbus.proto.features import Ask, Observations, Segment, Shard, ShardDone
 from factorbus.proto.messages import Job, JobDone
 
 _NUMBERS = (
@@ -36,15 +36,15 @@ def main() -> None:
 
 def vectors() -> dict[str, bytes]:
     """The golden messages by name: two pixels, a filter that has nothing but its camera."""
-    ask = features.encode_ask(Ask(_sighting(), "half"))
-    rows = features.encode_ask(Ask(_sighting(), "rows"))
-    factored = features.encode_ask(Ask(_sighting(_RADTAN), "factored"))
+    ask = features.encode_ask(Ask(_observations(), "half"))
+    rows = features.encode_ask(Ask(_observations(), "rows"))
+    factored = features.encode_ask(Ask(_observations(_RADTAN), "factored"))
     shard = _done(ask, 0, 2)
     segment = Segment(4711, 12, "1e" * 16, 8192, 4096)
     return {
         "ask": rows,
         "ask_half": ask,
-        "ask_into_segment": features.encode_ask(Ask(_sighting(), "rows", segment)),
+        "ask_into_segment": features.encode_ask(Ask(_observations(), "rows", segment)),
         "ask_radtan": factored,
         "shard": features.encode_shard(Shard(ask, 0, 2)),
         "shard_done_rows": _done(rows, 0, 1),
@@ -66,10 +66,10 @@ _RADIAL = Camera("radial", (2.0, 0.0125, 0.0125, 160.0, 120.0, 0.0625, 0.015625)
 _RADTAN = Camera("radtan", (458.0, 457.0, 367.0, 248.0, -0.25, 0.0625, 0.0, 0.0))
 
 
-def _sighting(camera: Camera = _RADIAL) -> Sighting:
+def _observations(camera: Camera = _RADIAL) -> Observations:
     state = np.array([0.0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0])
     pixels = np.array([[100.5, 60.25], [200.0, 150.0]])
-    return Sighting(camera, state, np.eye(13) / 64, pixels, 0.5, 0.25, 1.0)
+    return Observations(camera, state, np.eye(13) / 64, pixels, 0.5, 0.25, 1.0)
 
 
 def _done(ask: bytes, first: int, last: int) -> bytes:

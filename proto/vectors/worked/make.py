@@ -121,8 +121,8 @@ def _questions() -> dict[str, tuple[str, bytes]]:
                 np.array([POSE] * 2)),
         Factors("landmark_se2", np.array([[X[1], L[1]]]), np.array([[2.0, 1.4]]), np.array([POINT])),
     )  # fmt: skip
-    sights = np.array([[-0.9, 1.05], [0.2, 1.2], [5.0, 5.0]])
-    seen = asking.AskAssociate(X[3], "landmark_se2", sights, np.array([POINT] * 3), None, 0.95)
+    observations = np.array([[-0.9, 1.05], [0.2, 1.2], [5.0, 5.0]])
+    seen = asking.AskAssociate(X[3], "landmark_se2", observations, np.array([POINT] * 3), None, 0.95)
     return {
         "estimate": ("estimate", codec.encode_keys_asked(None)),
         "chi2": ("chi2", codec.encode_map({})),

@@ -58,8 +58,8 @@ class GraphFile:
         batch, lines, _ = self._joined()
         return planned_whole(self.path, batch, lines, use_values)
 
-    def account(self, whole: bool = False) -> dict[str, object]:
-        """A program's account of how the file was read; whole: of all in `batch`, not of what a replay drives."""
+    def summary(self, whole: bool = False) -> dict[str, object]:
+        """A program's summary of how the file was read; whole: of all in `batch`, not of what a replay drives."""
         left_out = {name: count for name, count in self.left_out.items() if not (whole and name in _IN_NO_STEP)}
         beside = {} if self.log is None else self.log.counts()
         return {"dialect": self.dialect, "notes": list(self.notes), "left_out": left_out, **beside}

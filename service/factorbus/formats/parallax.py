@@ -36,7 +36,7 @@ def lone_bearings(batch: Batch) -> I64:
 
 
 def delay_points(batch: Batch, ends: tuple[I64, ...], rank: I64, fixed: np.ndarray, poses: F64, entry: I64) -> None:
-    """Set in `entry` when each point that only bearings see enters, which its first sighting has set before.
+    """Set in `entry` when each point that only bearings see enters, which its first observation has set before.
 
     in      ends: per group of factors the rows of its variables   rank (N,): of poses, -1 for points   fixed (N,)
             poses (N, 3): x y theta of 2D poses, NaN where unknown

@@ -209,7 +209,7 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> 
     a point that is in, or a fixed one, is let in at the value its vertex line gives, if it has one; and so is a body
     that ranges determine.
     """
-    edges, sightings = _neighbours(_pairs(batch, names, False)), _neighbours(_pairs(batch, names, True))
+    edges, observations = _neighbours(_pairs(batch, names, False)), _neighbours(_pairs(batch, names, True))
     late = _late(_pairs(batch, names, False))
     entry = np.full(len(names.keys), -1, np.int64)
     known = set(np.flatnonzero(names.fixed & ~names.is_pose).tolist())
@@ -223,19 +223,19 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> 
 
     def enter(turn: int, first: int) -> list[int]:
         """Let `first` in and all poses that had been waiting for it; what may be let in now."""
-        waiting, sighted = [first], []
+        waiting, observed = [first], []
         while waiting:
             pose = waiting.pop()
             if entry[pose] >= 0:
                 continue
             entry[pose] = turn
-            sighted += ranges.of(pose)
+            observed += ranges.of(pose)
             waiting += [other for other, since in edges[pose] if is_next(other, turn) and since <= turn]
-            for point, _ in sightings[pose]:
+            for point, _ in observations[pose]:
                 if point not in known:
                     known.add(point)
-                    sighted += [*(seen for seen, _ in sightings[point]), *ranges.of(point)]
-        return sighted
+                    observed += [*(seen for seen, _ in observations[point]), *ranges.of(point)]
+        return observed
 
     def body_of(row: int, turn: int) -> list[int]:
         """A point alone, or the poses so far that odometry joins to a pose."""
@@ -257,7 +257,7 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> 
             row = candidates.pop()
             if not (is_next(row, turn) and names.valued[row] and (names.is_pose[row] or ranges.lone[row])):
                 continue
-            sees = names.is_pose[row] and any(point in known for point, _ in sightings[row])
+            sees = names.is_pose[row] and any(point in known for point, _ in observations[row])
             if sees or (ranges and ranges.determine(body_of(row, turn), is_in)):
                 given.append(row)
                 candidates += enter(turn, row)
@@ -314,9 +314,9 @@ def _enter_points(batch: Batch, names: Roster, entry: I64, ranges: Ranges) -> No
     """Entries of points that not only ranges see: with the first pose that does; of unseen ones that are known, at the
     start.
     """
-    sightings = _pairs(batch, names, points=True)
+    observations = _pairs(batch, names, points=True)
     first = np.full(len(entry), np.iinfo(np.int64).max)
-    seen = sightings[entry[sightings[:, 0]] >= 0]
+    seen = observations[entry[observations[:, 0]] >= 0]
     np.minimum.at(first, seen[:, 1], entry[seen[:, 0]])
     points = ~names.is_pose & ~ranges.lone
     known = names.fixed.copy()

@@ -40,7 +40,7 @@ class Steps(Sequence[Batch]):
 
     Poses come in the order of their keys, or of time where all have a stamp.  A step is a new pose with its edges to
     poses that are in (the one from the pose before it first, the rest in the order of the file), the points it is the
-    first to see, and its sightings.  A pose that nothing joins to earlier ones waits for the pose that does, and a
+    first to see, and its observations.  A pose that nothing joins to earlier ones waits for the pose that does, and a
     factor between two poses that is of a later time than both for a pose of its time.  New variables have no value, so
     that the service composes them from what was measured, except fixed ones, poses that only points or ranges join to
     the rest, points that only ranges see, and with `use_values` all that have one.  Where nothing is fixed and no pose

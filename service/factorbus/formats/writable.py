@@ -60,7 +60,7 @@ def writable(batch: Batch, form: Form, left: LeftOut) -> Batch:
     )
     factors = [kept for group in batch.factors if (kept := _writable_factors(group, gone, form, lost)) is not None]
     named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in factors)])
-    told = tuple(_told(variables, named, lost))
+    told = tuple(_with_values(variables, named, lost))
     for (name, why), count in lost.items():
         left.drop(name, count, why)
     return Batch(told, tuple(factors))
@@ -87,7 +87,7 @@ def _writable_factors(group: Factors, gone: I64, form: Form, lost: _Lost) -> Fac
     return Factors(group.kind, group.keys[kept], group.measured[kept], group.information[kept])
 
 
-def _told(variables: list[Variables], named: I64, lost: _Lost) -> Iterator[Variables]:
+def _with_values(variables: list[Variables], named: I64, lost: _Lost) -> Iterator[Variables]:
     """The variables that a vertex line or an edge tells of."""
     untold: list[str] = []
     for group in variables:

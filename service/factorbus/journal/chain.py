@@ -13,7 +13,7 @@ START = bytes(16)
 
 
 def extend_chain(chain: bytes, delta: bytes) -> bytes:
-    """The chain after a step that published `delta`: its variables count, not its account of work."""
+    """The chain after a step that published `delta`: its variables count, not its report."""
     digest = blake2b(chain, digest_size=16)
     message = codec.decode_delta(delta)
     digest.update(message.revision.to_bytes(8, "little"))

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from factorbus.wording import counted
 
 
-def told_faults(said: Iterable[tuple[str]]) -> str:
+def list_faults(said: Iterable[tuple[str]]) -> str:
     """Of the rows of `PRAGMA integrity_check` the first fault in its words, and how many more; empty: there is none."""
     lines = [line for (row,) in said for line in row.splitlines()]
     faults = [line for line in lines if line != "ok" and not line.startswith("***")]

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from factorbus.journal import chain
 from factorbus.journal.connecting import APPLICATION, FORM, connected, connection_to, what_reading_failed_with
 from factorbus.journal.digest import digest_of
-from factorbus.journal.faults import told_faults
+from factorbus.journal.faults import list_faults
 from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_folder
 from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal, NotWritten
 from factorbus.journal.records import Entry, Epoch, Header, JournalRecord, Maker, Sender
@@ -223,14 +223,14 @@ class Store:
     def check_form(self) -> None:
         """That tables and index are what SQLite made, not yet what is in them.  Raises JournalDamaged."""
         with self._reading():
-            faults = told_faults(self._db.execute("PRAGMA integrity_check(1)"))
+            faults = list_faults(self._db.execute("PRAGMA integrity_check(1)"))
         if faults:
             raise JournalDamaged(self.path, faults)
 
     def check(self) -> Iterator[str]:
         """Everything that is wrong with it: by SQLite's own check, by inserts' bytes, by clients' numbers."""
         try:
-            if faults := told_faults(self._db.execute("PRAGMA integrity_check(20)")):
+            if faults := list_faults(self._db.execute("PRAGMA integrity_check(20)")):
                 yield faults
             yield from self._check_sequences()
             revision = 0

@@ -103,7 +103,7 @@ def _serve(
     bus = open_service_bus(config)
     try:
         shell = Shell(bus, config, library)
-        shell.health_report.chapters["cores"] = cores.account
+        shell.health_report.chapters["cores"] = cores.counts
         try:
             shell.maps.create_all(config.create)
             shell.health_report.health.open = True
@@ -308,7 +308,7 @@ class Shell:
                 told = {"maps": self.maps.rows(), "service": self._service, "version": __version__, "protocol": known()}
                 self._delivery.answer(query, codec.encode_map(told))
             elif operation == "stats":
-                self._delivery.answer(query, codec.encode_map(self.health_report.account()))
+                self._delivery.answer(query, codec.encode_map(self.health_report.read()))
             elif operation == "create":
                 self._delivery.answer(
                     query, codec.encode_map(self.maps.create(*read_create(payload)) | {"protocol": known()})

@@ -18,14 +18,14 @@
     ├── BadRange               bad_range               a range that is not positive
     ├── BadDirection           bad_direction           a direction that is no vector of some length
     ├── BadLens                bad_lens                a lens that cannot be
-    ├── BadSight               bad_sight               a pixel of what the camera cannot see
+    ├── BadObservation         bad_observation         a pixel of what the camera cannot see
     ├── BadLoss                bad_loss                a loss that does not exist, or a scale that is not positive
     ├── NotPositiveDefinite    not_positive_definite   an information matrix that is not positive definite
     ├── Apart                  not_positive_definite   a factor in pieces that are not together
     ├── UnknownFactor          unknown_factor          a factor id that the map does not have, or not any more
     ├── NotInMap               unknown_variable        a change of a variable that the map does not have
     ├── InUse                  in_use                  variables to be removed alone that other factors are on
-    ├── TooConnected           too_connected           variables to be marginalized with too large a border
+    ├── TooConnected           too_connected           variables to be marginalized with too large a separator
     ├── BadOrder               bad_order               changes in an order that has no meaning
     ├── NamedTwice             named_twice             a change that names a factor or a variable twice
     ├── BadWeight              bad_weight              a weight out of its range
@@ -113,6 +113,8 @@ class UnknownKind(SolverError):
 
 
 class BadShape(SolverError):
+    """The solver's own, as it knows no wire; it travels as the problem of that name and code."""
+
     code = "bad_shape"
 
     def __init__(self, where: str, seen: str, wanted: str) -> None:
@@ -241,12 +243,12 @@ class BadLens(SolverError):
         super().__init__(f"{where}: of its lens seen {seen}, wanted {wanted}", where=where, seen=seen, wanted=wanted)
 
 
-class BadSight(SolverError):
-    code = "bad_sight"
+class BadObservation(SolverError):
+    code = "bad_observation"
 
     def __init__(self, where: str, pixel: tuple[float, float], reason: str) -> None:
         super().__init__(
-            f"{where}: pixel ({pixel[0]:.6g}, {pixel[1]:.6g}): {reason}; leave this sight out",
+            f"{where}: pixel ({pixel[0]:.6g}, {pixel[1]:.6g}): {reason}; leave this observation out",
             where=where,
             reason=reason,
         )
@@ -324,14 +326,14 @@ class InUse(SolverError):
 class TooConnected(SolverError):
     code = "too_connected"
 
-    def __init__(self, key: int, count: int, border: Sequence[int], most: int) -> None:
-        listed = ", ".join(map(printed, border[:8])) + (", ..." if len(border) > 8 else "")
+    def __init__(self, key: int, count: int, separator: Sequence[int], most: int) -> None:
+        listed = ", ".join(map(printed, separator[:8])) + (", ..." if len(separator) > 8 else "")
         super().__init__(
             f"{printed(key)} and what hangs together with it ({count} in all) cannot be marginalized: they share "
-            f"factors with {counted(len(border), 'other')}, {listed}; wanted at most {most}: marginalize some of these "
-            "as well, or remove some of its factors first",
+            f"factors with {counted(len(separator), 'other')}, {listed}; wanted at most {most}: marginalize some of "
+            "these as well, or remove some of its factors first",
             key=key,
-            border=list(border),
+            separator=list(separator),
         )
 
 

@@ -1,4 +1,4 @@
-"""The account of a step: what was done, why, and how long each part took."""
+"""The report of a step: what was done, why, and how long each part took."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -18,7 +18,7 @@ class StepReport(NamedTuple):
     iterations   Gauss-Newton or Levenberg-Marquardt steps that were accepted
     chi2, chi2_before        Σ rᵀ Ω r of all factors at the published estimate; and at the values before the step, the
                  new factors included, new variables at their first values (`Options.initialize_locally`)
-    new_variables, new_factors   taken in by this step
+    new_variables, new_factors   added by this step
     changed      variables whose values differ from before, the new ones included
     relinearized linearization points that were moved, counted once per iteration
     eliminated   variables eliminated, counted once per factorization

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from naive.block_systems import BlockSystem
+from naive.solver_parts import graph_in, system_in
 from scipy.sparse import csc_matrix, tril
 
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -72,7 +73,7 @@ class OurPass:
     """The batch pass of our solver on one graph."""
 
     def __init__(self, solver: Solver) -> None:
-        self._graph, self._blocks = solver._graph, solver._stepper.system.blocks
+        self._graph, self._blocks = graph_in(solver), system_in(solver).blocks
         self._dims = self._graph.dims[: self._graph.counts[at.COLUMNS]].copy()
         self._cholesky = Cholesky()
         # At the optimum η is 0 but for rounding; any other right-hand side tells more.
@@ -118,7 +119,7 @@ def whole(steps: Sequence[Batch], columns: Columns, values: dict[str, F64]) -> B
 
 def system_of(solver: Solver) -> BlockSystem:
     """Λ as the solver holds it."""
-    graph, blocks = solver._graph, solver._stepper.system.blocks
+    graph, blocks = graph_in(solver), system_in(solver).blocks
     dims = graph.dims[: graph.counts[at.COLUMNS]].copy()
     return BlockSystem(dims, blocks.rows.copy(), blocks.cols.copy(), blocks.data.copy(), blocks.offsets.copy())
 

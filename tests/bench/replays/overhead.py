@@ -52,9 +52,9 @@ def overhead(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, An
     """step: microseconds by kind of step; start: seconds; cold: seconds, when job["cold"]."""
     warm()
     steps = load(problem)
-    _drive(job["mode"], steps[:100], _nothing_inside)
+    drive(job["mode"], steps[:100], _nothing_inside)
     with timed_calls() as inside:
-        found = _drive(job["mode"], steps, inside, lambda k: tell({"done": k}))
+        found = drive(job["mode"], steps, inside, lambda k: tell({"done": k}))
     return {"step": found, "start": starts(job["mode"]), "cold": cold_compile() if job["cold"] else None}
 
 
@@ -82,7 +82,7 @@ def timed_calls() -> Iterator[Callable[[Any], float]]:
     """Within it, a function that gives the seconds spent in compiled calls since it was asked last."""
     spent = [0, 0]
     replaced = []
-    for module in _python_modules():
+    for module in python_modules():
         for name, function in list(vars(module).items()):
             if getattr(function, "factorbus_signatures", ()):
                 replaced.append((module, name, function))
@@ -101,7 +101,7 @@ def timed_calls() -> Iterator[Callable[[Any], float]]:
             setattr(module, name, function)
 
 
-def _drive(
+def drive(
     mode: str, steps: Sequence[Batch], inside: Callable[[Any], float], tell: Callable[[int], None] = lambda _: None
 ) -> dict[str, Any]:
     solver, rows = Solver(Options(mode=mode, clock=time.perf_counter)), np.zeros((len(steps), 2))
@@ -149,7 +149,7 @@ def _timing(function: Callable[..., Any], spent: list[int], which: int) -> Calla
     return call
 
 
-def _python_modules() -> Iterator[Any]:
+def python_modules() -> Iterator[Any]:
     """Modules of the solver that call kernels, not those that define them."""
     for entry in pkgutil.iter_modules(factorbus.solver.__path__):
         if not entry.ispkg:

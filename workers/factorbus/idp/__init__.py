@@ -2,8 +2,8 @@
 
 `workers/MATH.md` has the equations.
 
-    seen = see(sighting)                      y, and its derivatives by the camera and by the pixel
-    minimal.covariance(P, sighting, seen)     P with the new features; or rows of it, its upper half, its factors
+    seen = see(observations)                      y, and its derivatives by the camera and by the pixel
+    minimal.covariance(P, observations, seen)     P with the new features; or rows of it, its upper half, its factors
     independent.covariance(P, A, B, padd)     the same as the 2011 paper has it, and
     classical.covariance(P, A, B, padd)       as it was before
     job.do(payload)                           the job of kind `idp`, in any process

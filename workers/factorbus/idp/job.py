@@ -22,20 +22,20 @@ def do(payload: bytes) -> bytes:
 
 def done(shard: Shard, ask: Ask) -> ShardDone:
     """`shard` of the question `ask`.  Raises BadMessage, TooLarge, BadShape, BadState, BadPixel."""
-    first, last, n = shard.first, shard.last, ask.sighting.count
+    first, last, n = shard.first, shard.last, ask.observations.count
     if last > n:
         raise BadMessage("last", f"is {last}", f"at most {n}, the number of pixels")
     if answer_size(ask) > ANSWER_LIMITS.max_bytes:
         raise TooLarge(
             "the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes", "ask for fewer features at a time"
         )
-    seen = see(ask.sighting)
+    seen = see(ask.observations)
     y = seen.y[first:last]
     if ask.form == "factored":
-        found = covariance_factors(ask.sighting, seen, first, last)
+        found = covariance_factors(ask.observations, seen, first, last)
         return ShardDone(first, last, y, turn=found.turn, own=found.own, U=found.U, S=found.S)
     if ask.form == "half":
-        half = FeatureRows(ask.sighting, seen, first).half(first, last)
+        half = FeatureRows(ask.observations, seen, first).half(first, last)
         return ShardDone(first, last, y, cross=half.cross, blocks=half.blocks)
     if ask.segment is not None and _stored(shard, ask, ask.segment, seen):
         return ShardDone(first, last, y, stored=True)
@@ -44,18 +44,18 @@ def done(shard: Shard, ask: Ask) -> ShardDone:
 
 def _stored(shard: Shard, ask: Ask, segment: Segment, seen: Seen) -> bool:
     """Whether the rows could be written to shared memory."""
-    n, m = ask.sighting.count, ask.sighting.width
+    n, m = ask.observations.count, ask.observations.width
     width, rows = m + FEATURE * n, FEATURE * (shard.last - shard.first)
     start = 8 * FEATURE * shard.first * width
     out = segments.try_array(segment, new_rows_size(n, m), start, (rows, width)) if rows else None
     if out is None:
         return False
-    FeatureRows(ask.sighting, seen).rows(shard.first, shard.last, out)
+    FeatureRows(ask.observations, seen).rows(shard.first, shard.last, out)
     return True
 
 
 def _rows(shard: Shard, ask: Ask, seen: Seen) -> np.ndarray:
-    n, m = ask.sighting.count, ask.sighting.width
+    n, m = ask.observations.count, ask.observations.width
     if (size := new_rows_size(n, m)) > ANSWER_LIMITS.max_bytes:
         raise TooLarge(
             "the answer, which cannot go to shared memory,",
@@ -65,5 +65,5 @@ def _rows(shard: Shard, ask: Ask, seen: Seen) -> np.ndarray:
             "ask for fewer features at a time",
         )
     rows = np.empty((FEATURE * (shard.last - shard.first), m + FEATURE * n))
-    FeatureRows(ask.sighting, seen).rows(shard.first, shard.last, rows)
+    FeatureRows(ask.observations, seen).rows(shard.first, shard.last, rows)
     return rows

@@ -8,7 +8,7 @@ from factorbus.idp.classical import Counted
 from factorbus.idp.kernels import minimal as kernels
 from factorbus.idp.kernels.compile import F64
 from factorbus.idp.new_features import Seen, contiguous
-from factorbus.proto.features import FEATURE, Sighting
+from factorbus.proto.features import FEATURE, Observations
 
 
 class Half(NamedTuple):
@@ -36,16 +36,16 @@ class CovarianceFactors(NamedTuple):
     multiplications: int
 
 
-def covariance(P: F64, sighting: Sighting, seen: Seen, out: F64 | None = None) -> Counted:
-    """P after adding the features of `sighting`.
+def covariance(P: F64, observations: Observations, seen: Seen, out: F64 | None = None) -> Counted:
+    """P after adding the features of `observations`.
 
-    in   P (m, m), of which sighting.covariance are the first 13 rows
+    in   P (m, m), of which observations.covariance are the first 13 rows
     out  P (m + 6 n, m + 6 n), in `out` if it is given
     """
     m, n = len(P), len(seen.y)
     after = np.empty((m + FEATURE * n, m + FEATURE * n)) if out is None else out
     after[:m, :m] = P
-    new = FeatureRows(sighting, seen)
+    new = FeatureRows(observations, seen)
     count = new.multiplications + new.rows(0, n, after[m:])
     kernels.mirror(m, after)
     return Counted(after, count)
@@ -58,13 +58,13 @@ class FeatureRows:
     multiplications: what making these took.
     """
 
-    def __init__(self, sighting: Sighting, seen: Seen, first: int = 0) -> None:
+    def __init__(self, observations: Observations, seen: Seen, first: int = 0) -> None:
         n = len(seen.y)
-        self._variance = sighting.sigma_rho * sighting.sigma_rho
-        U, S, count = _shared(sighting)
+        self._variance = observations.sigma_rho * observations.sigma_rho
+        U, S, count = _shared(observations)
         V, W, own = np.empty((n, 6)), np.empty((n, 6)), np.empty((n, 3))
         count += kernels.feature_factors(first, seen.turn, U, S, V, W)
-        count += kernels.own_variances(seen.slope[first:], sighting.sigma_pixel, own[first:])
+        count += kernels.own_variances(seen.slope[first:], observations.sigma_pixel, own[first:])
         self._factors = kernels.RowFactors(seen.turn, U, V, W, own)
         self.multiplications = count
 
@@ -84,12 +84,14 @@ class FeatureRows:
         return Half(cross, blocks, count)
 
 
-def covariance_factors(sighting: Sighting, seen: Seen, first: int = 0, last: int | None = None) -> CovarianceFactors:
+def covariance_factors(
+    observations: Observations, seen: Seen, first: int = 0, last: int | None = None
+) -> CovarianceFactors:
     """The factors, of features first .. last−1: O(m + n) numbers and multiplications.  MATH §5.4"""
     chosen = Seen(*(array[first:last] for array in seen))
-    U, S, count = _shared(sighting)
+    U, S, count = _shared(observations)
     own = np.empty((len(chosen.y), 3))
-    count += kernels.own_variances(chosen.slope, sighting.sigma_pixel, own)
+    count += kernels.own_variances(chosen.slope, observations.sigma_pixel, own)
     return CovarianceFactors(U, S, chosen.turn, own, count)
 
 
@@ -98,7 +100,7 @@ def blocks_in(n: int, first: int, last: int) -> int:
     return (last - first) * n - (last * (last - 1) - first * (first - 1)) // 2
 
 
-def _shared(sighting: Sighting) -> tuple[F64, F64, int]:
-    U, S = np.empty((6, sighting.width)), np.empty((3, 3))
-    count = kernels.share(contiguous(sighting.state), contiguous(sighting.covariance), U, S)
+def _shared(observations: Observations) -> tuple[F64, F64, int]:
+    U, S = np.empty((6, observations.width)), np.empty((3, 3))
+    count = kernels.share(contiguous(observations.state), contiguous(observations.covariance), U, S)
     return U, S, count

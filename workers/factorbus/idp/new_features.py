@@ -9,7 +9,7 @@ from factorbus.idp.kernels import layout as at
 from factorbus.idp.kernels import rays as kernels
 from factorbus.idp.kernels.compile import F64
 from factorbus.idp.lenses import camera_model
-from factorbus.proto.features import CAMERA_STATE, FEATURE, BadPixel, BadState, Sighting
+from factorbus.proto.features import CAMERA_STATE, FEATURE, BadPixel, BadState, Observations
 from factorbus.proto.problems import BadShape
 
 _REASONS = {
@@ -35,14 +35,14 @@ class Seen(NamedTuple):
     slope: F64
 
 
-def see(sighting: Sighting) -> Seen:
-    """The features of a sighting.  Raises BadShape, BadState, BadPixel: then nothing is computed for any of them."""
-    _check(sighting)
-    n = sighting.count
+def see(observations: Observations) -> Seen:
+    """The features of `observations`.  Raises BadShape, BadState, BadPixel: then nothing is computed for any."""
+    _check(observations)
+    n = observations.count
     seen = Seen(np.empty((n, FEATURE)), np.empty((n, 4)), np.empty((n, 4)))
     status = np.empty(n, np.int64)
-    state, pixels = contiguous(sighting.state), contiguous(sighting.pixels)
-    kernels.features_of_pixels(camera_model(sighting.camera), state, float(sighting.rho), pixels, *seen, status)
+    state, pixels = contiguous(observations.state), contiguous(observations.pixels)
+    kernels.features_of_pixels(camera_model(observations.camera), state, float(observations.rho), pixels, *seen, status)
     if status.any():
         first = int(np.flatnonzero(status)[0])
         u, v = pixels[first].tolist()
@@ -50,17 +50,17 @@ def see(sighting: Sighting) -> Seen:
     return seen
 
 
-def jacobians(sighting: Sighting, seen: Seen) -> tuple[F64, F64]:
+def jacobians(observations: Observations, seen: Seen) -> tuple[F64, F64]:
     """A = ∂y/∂x_v (n, 6, 13) and B = ∂y/∂h_d (n, 6, 3), h_d = (u, v, ρ).  MATH (4.1), (4.2)"""
     n = len(seen.y)
     A, B = np.empty((n, FEATURE, CAMERA_STATE)), np.empty((n, FEATURE, 3))
-    kernels.feature_jacobians(contiguous(sighting.state), seen.turn, seen.slope, A, B)
+    kernels.feature_jacobians(contiguous(observations.state), seen.turn, seen.slope, A, B)
     return A, B
 
 
-def padd(sighting: Sighting) -> F64:
+def padd(observations: Observations) -> F64:
     """Padd (3, 3): the covariance of (u, v, ρ) of one feature.  MATH (5.1)"""
-    return np.diag([sighting.sigma_pixel**2, sighting.sigma_pixel**2, sighting.sigma_rho**2])
+    return np.diag([observations.sigma_pixel**2, observations.sigma_pixel**2, observations.sigma_rho**2])
 
 
 def contiguous(array: F64) -> F64:
@@ -68,22 +68,24 @@ def contiguous(array: F64) -> F64:
     return array if array.flags.carray and array.dtype == np.float64 else np.array(array, np.float64, order="C")
 
 
-def _check(sighting: Sighting) -> None:
+def _check(observations: Observations) -> None:
     for name, array, wanted in (
-        ("state", sighting.state, (CAMERA_STATE,)),
-        ("covariance", sighting.covariance, (CAMERA_STATE, -1)),
-        ("pixels", sighting.pixels, (-1, 2)),
+        ("state", observations.state, (CAMERA_STATE,)),
+        ("covariance", observations.covariance, (CAMERA_STATE, -1)),
+        ("pixels", observations.pixels, (-1, 2)),
     ):
         if array.ndim != len(wanted) or any(w not in (-1, s) for w, s in zip(wanted, array.shape, strict=True)):
             shape = " × ".join("n" if w < 0 else str(w) for w in wanted)
-            raise BadShape(f"sighting.{name}", " × ".join(map(str, array.shape)), shape)
-    if sighting.width < CAMERA_STATE:
-        raise BadShape("sighting.covariance", f"13 × {sighting.width}", "13 × m with m ≥ 13, the camera first")
-    _check_prior(sighting)
-    if not np.isfinite(sighting.state).all() or not np.linalg.norm(sighting.state[3:7]) > 1e-6:
-        raise BadState("state", str(sighting.state.tolist())[:120], "13 finite numbers with a quaternion q0 qx qy qz")
-    own = sighting.covariance[:, :CAMERA_STATE]
-    if not np.isfinite(sighting.covariance).all():
+            raise BadShape(f"observations.{name}", " × ".join(map(str, array.shape)), shape)
+    if observations.width < CAMERA_STATE:
+        raise BadShape("observations.covariance", f"13 × {observations.width}", "13 × m with m ≥ 13, the camera first")
+    _check_prior(observations)
+    if not np.isfinite(observations.state).all() or not np.linalg.norm(observations.state[3:7]) > 1e-6:
+        raise BadState(
+            "state", str(observations.state.tolist())[:120], "13 finite numbers with a quaternion q0 qx qy qz"
+        )
+    own = observations.covariance[:, :CAMERA_STATE]
+    if not np.isfinite(observations.covariance).all():
         raise BadState("covariance", "not finite everywhere", "finite numbers")
     if not (np.diag(own) >= 0.0).all():
         raise BadState("covariance", f"negative on its diagonal: {np.diag(own).min():.3g}", "variances")
@@ -91,10 +93,10 @@ def _check(sighting: Sighting) -> None:
         raise BadState("covariance", f"asymmetric by {worst:.3g}", "the first 13 rows of a symmetric P")
 
 
-def _check_prior(sighting: Sighting) -> None:
-    if not math.isfinite(sighting.rho):
-        raise BadState("rho", sighting.rho, "a finite inverse distance, 1/metre")
+def _check_prior(observations: Observations) -> None:
+    if not math.isfinite(observations.rho):
+        raise BadState("rho", observations.rho, "a finite inverse distance, 1/metre")
     for name in ("sigma_rho", "sigma_pixel"):
-        sigma = getattr(sighting, name)
+        sigma = getattr(observations, name)
         if not (math.isfinite(sigma) and sigma > 0.0):
             raise BadState(name, sigma, "a standard deviation above 0")

@@ -124,7 +124,7 @@ def gate_command(
         for told, distance, allowed, plausible in zip(_described(factors), *columns, strict=True)
     ]
     if as_json:
-        document({"revision": found.revision, "read": read.account(), "candidates": rows})
+        document({"revision": found.revision, "read": read.summary(), "candidates": rows})
     else:
         table(
             [
@@ -153,7 +153,7 @@ def gain_command(address: MapAddress, candidates: Path, dialect: str | None, str
     rows = sorted(zip(_described(factors), found.gain.tolist(), strict=True), key=lambda row: -row[1])
     if as_json:
         content = [{"factor": told, "gain": gain} for told, gain in rows]
-        document({"revision": found.revision, "read": read.account(), "candidates": content})
+        document({"revision": found.revision, "read": read.summary(), "candidates": content})
     else:
         table([(told, f"{gain:.4g}") for told, gain in rows], title=f"Nats at revision {found.revision}")
     return OK
@@ -188,11 +188,11 @@ def why_command(address: MapAddress, what: str, variable: bool, factor: bool, as
     if only == "factor" and not what.isdecimal():
         raise click.UsageError(f"--factor wants an id, a whole number; {what!r} is the key of a variable")
     with _map(address) as joined:
-        told = _accounts(joined, what, only)
+        told = _explanations(joined, what, only)
     if as_json:
         content = {"revision": told[0].revision, "variable": {}, "factor": {}, "step": told[0].step}
         for found in told:
-            content |= {kind: account for kind in ("variable", "factor") if (account := getattr(found, kind))}
+            content |= {kind: explained for kind in ("variable", "factor") if (explained := getattr(found, kind))}
         document(content)
         return OK
     for found in told:
@@ -200,7 +200,7 @@ def why_command(address: MapAddress, what: str, variable: bool, factor: bool, as
     return OK
 
 
-def _accounts(joined: Any, what: str, only: str | None) -> list[Any]:
+def _explanations(joined: Any, what: str, only: str | None) -> list[Any]:
     """Of the variable, of the factor, or of both where WHAT may be either.  Raises Refused."""
     from factorbus.client import Refused
 
@@ -224,10 +224,10 @@ def _accounts(joined: Any, what: str, only: str | None) -> list[Any]:
 def _tell(what: str, found: Any) -> None:
     if found.variable:
         table(_variable_rows(found.variable), title=f"{what} at revision {found.revision}")
-        rows = [(_told(each), _factor_line(each, found.step)) for each in found.variable["factors"]]
+        rows = [(_named(each), _factor_line(each, found.step)) for each in found.variable["factors"]]
         table(rows, title="Its factors, by id")
     else:
-        table([(_told(found.factor), _factor_line(found.factor, found.step))], title=f"At revision {found.revision}")
+        table([(_named(found.factor), _factor_line(found.factor, found.step))], title=f"At revision {found.revision}")
     step = found.step
     if step:
         table([("the last step", f"{step['strategy']}, because {step['because']}")])
@@ -321,38 +321,39 @@ def repair_command(
     return OK
 
 
-def _variable_rows(account: Any) -> list[tuple[str, str]]:
+def _variable_rows(explained: Any) -> list[tuple[str, str]]:
     return [
-        ("kind", account["kind"] + (", fixed" if account["fixed"] else "")),
-        *([("time stamp", f"{account['stamp']} ns")] if account.get("stamp") is not None else []),
-        ("value", "  ".join(f"{number:.6g}" for number in account["value"])),
-        ("sigmas", "  ".join(f"{number:.4g}" for number in account["sigmas"])),
-        ("smallest pivot of R", f"{account['pivot']:.4g}"),
-        ("smallest R²ᵢᵢ/Λᵢᵢ", f"{account['conditioning']:.2g}"),
+        ("kind", explained["kind"] + (", fixed" if explained["fixed"] else "")),
+        *([("time stamp", f"{explained['stamp']} ns")] if explained.get("stamp") is not None else []),
+        ("value", "  ".join(f"{number:.6g}" for number in explained["value"])),
+        ("sigmas", "  ".join(f"{number:.4g}" for number in explained["sigmas"])),
+        ("smallest pivot of R", f"{explained['pivot']:.4g}"),
+        ("smallest R²ᵢᵢ/Λᵢᵢ", f"{explained['conditioning']:.2g}"),
     ]
 
 
-def _factor_line(account: Any, step: Any) -> str:
+def _factor_line(explained: Any, step: Any) -> str:
     from factorbus.proto.why_text import fall_without
 
-    if account.get("inactive"):
-        return f"inactive: {account['inactive']}"
-    without, loss = account["without"], account.get("loss")
+    if explained.get("inactive"):
+        return f"inactive: {explained['inactive']}"
+    without, loss = explained["without"], explained.get("loss")
     fall = "no redundancy: nothing else measures it"
     if without is not None:
         fall = f"without it χ² falls by {fall_without(without, step)}"
-    share = f"leverage {account['influence']:.2f} of {account['dims']}"
+    share = f"leverage {explained['influence']:.2f} of {explained['dims']}"
     if not loss:
-        return f"χ² {account['chi2']:.3g}, {share}, {fall}"
-    counts = f"rᵀΩr {account['chi2']:.3g}, of which {loss} counts {account['rho']:.3g} (weight {account['weight']:.2g})"
+        return f"χ² {explained['chi2']:.3g}, {share}, {fall}"
+    rho, weight = explained["rho"], explained["weight"]
+    counts = f"rᵀΩr {explained['chi2']:.3g}, of which {loss} counts {rho:.3g} (weight {weight:.2g})"
     return f"{counts}, {share}, {fall}"
 
 
-def _told(account: Any) -> str:
+def _named(explained: Any) -> str:
     from factorbus.proto.symbols import format_symbol
 
-    ends = ", ".join(format_symbol(key) for key in account["keys"])
-    return f"{account['factor']} {account['kind']} ({ends})"
+    ends = ", ".join(format_symbol(key) for key in explained["keys"])
+    return f"{explained['factor']} {explained['kind']} ({ends})"
 
 
 def _word(plausible: bool) -> str:

@@ -43,7 +43,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     journal    inserts a second with each durability, in turn, at a window of 32; --folder: on the disk to measure
     soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;
                --inserts, --minutes
-    digest     the account of every step and the bits of every estimate, as digests; --out FOLDER, --against FOLDER
+    digest     the report of every step and the bits of every estimate, as digests; --out FOLDER, --against FOLDER
     all        cholesky, bus, idp, ros2 and journal: some minutes
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
@@ -56,13 +56,13 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     factorbus bench peers --only intel,manhattan3500
     factorbus bench all --json > bench.json
     """
-    folder = _folder()
+    where = folder()
     names = BENCHES if name == "all" else (name,)
     codes, results = {}, {}
     for each in names:
         print_note(f"bench {each}")
         ran = subprocess.run(
-            [sys.executable, str(folder / _file(each)), *(["--json"] if as_json else []), *options],
+            [sys.executable, str(where / file_of(each)), *(["--json"] if as_json else []), *options],
             stdout=subprocess.PIPE if as_json else None,
             text=True,
             check=False,
@@ -78,18 +78,18 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     return FAILED if missed else OK
 
 
-def _folder() -> Path:
+def folder() -> Path:
     """tests/bench of the checkout that this package is installed from.  Raises Stopped."""
-    folder = Path(__file__).resolve().parents[4] / "tests" / "bench"
-    if not all((folder / _file(name)).is_file() for name in (*BENCHES, *ASKED, *LONG)):
+    found = Path(__file__).resolve().parents[4] / "tests" / "bench"
+    if not all((found / file_of(name)).is_file() for name in (*BENCHES, *ASKED, *LONG)):
         raise Stopped(
             "no_repository",
             "the benchmarks are not part of the installed package: clone the repository and run `make bench` there",
         )
-    return folder
+    return found
 
 
-def _file(name: str) -> str:
+def file_of(name: str) -> str:
     """The file of a benchmark."""
     return f"{name.replace('-', '_')}.py"
 

@@ -79,7 +79,7 @@ def command(
         files, notes, counts = _written(graph, target, strict, robot, ids or "auto")
     say(target, notes)
     if as_json:
-        about = {"source": str(source), "read": graph.account(whole=True), "files": [str(file) for file in files]}
+        about = {"source": str(source), "read": graph.summary(whole=True), "files": [str(file) for file in files]}
         document({**about, "notes": list(notes), **counts})
     told = ", ".join(counted(counts[many], one) for many, one in COUNTED)
     print_note(f"{', '.join(map(str, files))}: {told}")

@@ -220,7 +220,7 @@ def _row(dataset: Dataset, places: Places) -> dict[str, Any]:
         "poses": dataset.poses,
         "landmarks": dataset.landmarks,
         "edges": dataset.edges,
-        "landmark_edges": dataset.sightings,
+        "landmark_edges": dataset.observations,
         "vertex_lines": dataset.vertices,
         "chi2_optimum": dataset.optimum,
         "sha256": dataset.sha256,

@@ -114,7 +114,7 @@ def run_demo(request: DemoRequest) -> dict[str, Any]:
         driven = json.loads(robot.output(timeout_s=60))
         viewer.wait_for(driven["revision"])
         viewer.compare()
-        compared, seen = viewer.compared(), viewer.account()
+        compared, seen = viewer.compared(), viewer.summary()
         estimate, reports = viewer.estimate(), viewer.reports
     world = World(request.world, request.poses, request.seed)
     result = {

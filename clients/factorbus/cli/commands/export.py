@@ -4,20 +4,13 @@ from pathlib import Path
 
 import click
 
-from factorbus.cli.process.options import out_option
+from factorbus.cli.process.options import journal_option, out_option
 from factorbus.proto.keys import checked_name
 
 
 @click.command()
 @click.argument("name", metavar="MAP")
-@click.option(
-    "--journal",
-    "folder",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="DIR",
-    help="The folder that `factorbus serve` has.",
-)
+@journal_option
 @out_option("--out", "out", "The file.  [default: MAP.fbmap here]", "FILE")
 def command(name: str, folder: Path, out: Path | None) -> None:
     """Copy MAP out of a service's journal into one file: every insert, clients' places, the newest checkpoint.

@@ -3,8 +3,8 @@
 import click
 
 from factorbus.cli.output.exits import require
+from factorbus.cli.process.bind_address import insecure_option, refuse_open_page
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.exposure import insecure_option, refuse_open_page
 from factorbus.cli.process.options import connect_option, zenoh_option
 
 

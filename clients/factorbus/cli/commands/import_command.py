@@ -4,20 +4,13 @@ from pathlib import Path
 
 import click
 
-from factorbus.cli.process.options import file_argument
+from factorbus.cli.process.options import file_argument, journal_option
 from factorbus.proto.keys import checked_name
 
 
 @click.command()
 @file_argument("file")
-@click.option(
-    "--journal",
-    "folder",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="DIR",
-    help="The folder that `factorbus serve` has.",
-)
+@journal_option
 @click.option("--as", "name", metavar="MAP", help="Its name here.  [default: that of the file]")
 def command(file: Path, folder: Path, name: str | None) -> None:
     """Put the map that `factorbus export` wrote to FILE into a service's journal.

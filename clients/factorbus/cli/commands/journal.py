@@ -9,18 +9,10 @@ import click
 
 from factorbus.cli.output import console as screen
 from factorbus.cli.output.exits import FAILED, OK, report, require
-from factorbus.cli.process.options import json_option
+from factorbus.cli.process.options import journal_option, json_option
 from factorbus.wording import counted
 
 _MAP = click.argument("names", nargs=-1, metavar="[MAP ...]")
-_FOLDER = click.option(
-    "--journal",
-    "folder",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="DIR",
-    help="The folder that `factorbus serve` has.",
-)
 
 _NEXT = (
     "restore its folder from a copy, or give it up with `factorbus drop {name} --damaged` and `factorbus import` an "
@@ -41,7 +33,7 @@ def command() -> None:
 
 @command.command()
 @_MAP
-@_FOLDER
+@journal_option
 @json_option
 def show(names: tuple[str, ...], folder: Path, as_json: bool) -> int:
     """What there is of MAP, or of every map. One that does not open hides no other; the exit code is then 5."""
@@ -81,7 +73,7 @@ def _row(store: Any) -> dict[str, Any]:
 
 @command.command()
 @_MAP
-@_FOLDER
+@journal_option
 def check(names: tuple[str, ...], folder: Path) -> int:
     """Is it sound: the database, every insert's bytes, every client's numbers, every checkpoint? Exit code 1: no."""
     sound = True
@@ -115,7 +107,7 @@ def _wrong_with(folder: Path) -> Iterator[str]:
 
 @command.command()
 @_MAP
-@_FOLDER
+@journal_option
 def verify(names: tuple[str, ...], folder: Path) -> int:
     """Apply everything again, from the first insert on: is every revision the same, to the bit? Exit code 1: no.
 

@@ -35,12 +35,12 @@ def command(endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> None:
     if as_json:
         screen.document({"maps": [asdict(row) for row in rows]})
     elif rows:
-        screen.table([(row.name, _told(row)) for row in rows])
+        screen.table([(row.name, _shown(row)) for row in rows])
     else:
         screen.print_note(f"there is no map at {endpoint} yet")
 
 
-def _told(row: "MapRow") -> str:
+def _shown(row: "MapRow") -> str:
     if row.problem:
         why, way = f"`factorbus stats {row.name}` says why", f"`factorbus drop {row.name} --damaged` gives it up"
         return f"does not open ({row.state}): {why}, {way}"

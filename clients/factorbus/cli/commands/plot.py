@@ -109,7 +109,7 @@ def drive_command(
     from factorbus.cli.driving.picture import history_of
     from factorbus.cli.output.console import progress
     from factorbus.solver import warm
-    from factorbus.viz import drive_figure, save
+    from factorbus.viz import drive_figure
 
     warm()  # so that the first steps do not load kernels
     target = LocalMap(mode)
@@ -122,9 +122,7 @@ def drive_command(
     figure = drive_figure(
         history_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
     )
-    with output_file(path):
-        save(figure, path, name)
-    click.echo(path)
+    _save(figure, path, name)
 
 
 @command.command("sparsity")
@@ -143,12 +141,10 @@ def sparsity_command(
     require("service", "factorbus plot sparsity")
     drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict))
     from factorbus.cli.output.sparsity import pattern_of
-    from factorbus.viz import save, sparsity_figure
+    from factorbus.viz import sparsity_figure
 
     path = drawn.file("sparsity", out)
-    with output_file(path):
-        save(sparsity_figure(pattern_of(drawn.graph), drawn.name), path, drawn.name)
-    click.echo(path)
+    _save(sparsity_figure(pattern_of(drawn.graph), drawn.name), path, drawn.name)
 
 
 @command.command("tree")
@@ -167,16 +163,23 @@ def tree_command(
     require("service", "factorbus plot tree")
     drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict))
     from factorbus.cli.output.sparsity import last_loop, pattern_of
-    from factorbus.viz import save, tree_figure
+    from factorbus.viz import tree_figure
 
     path = drawn.file("tree", out)
     pattern = pattern_of(drawn.graph)
-    with output_file(path):
-        save(tree_figure(pattern, last_loop(drawn.graph, pattern), drawn.name), path, drawn.name)
-    click.echo(path)
+    _save(tree_figure(pattern, last_loop(drawn.graph, pattern), drawn.name), path, drawn.name)
 
 
 def _ready(load: Callable[[], Any]) -> Any:
     """What `load` gives, once it is known that a picture can be drawn."""
     require("viz", "factorbus plot")
     return load()
+
+
+def _save(figure: Any, path: Path, name: str) -> None:
+    """The picture in its file, whose name is printed."""
+    from factorbus.viz import save
+
+    with output_file(path):
+        save(figure, path, name)
+    click.echo(path)

@@ -164,7 +164,7 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
     graph = read_graph(request.file, request.dialect, request.strict)
     steps = graph.steps(use_values=request.use_values)
     with _target(request) as target:
-        before = target.account()
+        before = target.summary()
         with screen.progress(request.file.name, steps.poses) as show:
             driven = insert_steps(target, _paced(steps, request.pace), request.every, show)
         unsettled = target.chi2()
@@ -178,7 +178,7 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
             with output_file(request.plot):
                 _draw(request.plot, request.file.name, driven, target, steps, truth)
         result = _document(request, driven, target, steps, last, unsettled, before)
-        result |= {"read": graph.account(), "written": [str(file) for file in written], "adopted": adopted}
+        result |= {"read": graph.summary(), "written": [str(file) for file in written], "adopted": adopted}
         result |= {"error_m": aligned_error_m(truth, target.estimate())} if truth else {}
         report(result)
         if request.live:
@@ -204,7 +204,7 @@ def _document(
     request: ReplayRequest, driven: Any, target: Any, steps: Any, last: Any, unsettled: float, before: Any
 ) -> dict[str, Any]:
     """What was measured."""
-    measured, after = driven.measures(), target.account()
+    measured, after = driven.measures(), target.summary()
     return {
         "file": str(request.file),
         "where": request.where,

@@ -26,5 +26,5 @@ def command(endpoint: str, map_name: str, world: str, poses: int, seed: int, unt
     with connect(endpoint, client="robot") as bus, bus.map(map_name) as joined:
         target = RemoteMap(joined)
         driven = insert_steps(target, (step.batch for step in WORLDS[world.replace("-", "_")](poses=poses, seed=seed)))
-        document(driven.measures() | target.account())
+        document(driven.measures() | target.summary())
         target.close()

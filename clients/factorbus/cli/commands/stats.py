@@ -57,20 +57,20 @@ def _of_map(services: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     return found
 
 
-def _rows(account: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    state = "ready" if account["ready"] else "alive, not ready" if account["alive"] else "stuck"
-    stuck = f": {', '.join(account['stuck'])}" if account["stuck"] else ""
-    yield "state", f"{state}{stuck}, for {_span(account['uptime_s'])}, version {account['version']}"
-    memory = account["memory"]
+def _rows(service: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    state = "ready" if service["ready"] else "alive, not ready" if service["alive"] else "stuck"
+    stuck = f": {', '.join(service['stuck'])}" if service["stuck"] else ""
+    yield "state", f"{state}{stuck}, for {_span(service['uptime_s'])}, version {service['version']}"
+    memory = service["memory"]
     yield "memory", f"{memory['resident_bytes'] >> 20} MiB of {memory['limit_bytes'] >> 20} MiB"
-    workers = account.get("workers", ())
+    workers = service.get("workers", ())
     told = ", ".join(f"{each['name']} ({each['in_flight']} of {each['slots']})" for each in workers)
     yield "workers", told or "none: jobs are done in place"
-    for row in account["maps"]:
+    for row in service["maps"]:
         yield f"map {row['name']}", _map(row)
-    for row in account.get("unopened", ()):
+    for row in service.get("unopened", ()):
         yield f"map {row['name']}", f"does not open ({row['state']}): {row['problem']}"
-    for name, value in _told(account.get("journal", {})):
+    for name, value in shown(service.get("journal", {})):
         yield f"journal {name}", value
 
 
@@ -85,12 +85,12 @@ def _map(row: Mapping[str, Any]) -> str:
         f"{inserts['busy']} answered busy; {row['waiting']} waiting, {row['parked']} parked; "
         f"{counted(row['clients'], 'client')}",
         *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
-        *(f"journal {name}: {value}" for name, value in _told(row.get("journal", {}))),
+        *(f"journal {name}: {value}" for name, value in shown(row.get("journal", {}))),
     ]
     return "\n".join(lines)
 
 
-def _told(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def shown(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Fields that have something to say: names in words, times to three digits."""
     for name, value in fields.items():
         if value not in ("", None):

@@ -50,21 +50,21 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
             "take --once for one look, or --json for a program"
         )
     with stop_on_signals(until_eof) as stop, open_bus(endpoint, "top", zenoh) as bus:
-        gauges = Indicators(bus)
-        seen = gauges.read()
+        indicators = Indicators(bus)
+        seen = indicators.read()
         if once or as_json:
             stop.wait(every_s)
-            seen = gauges.read()
+            seen = indicators.read()
             if as_json:
                 screen.document(seen)
             else:
-                console.print(_view(seen, endpoint, console))
+                console.print(view(seen, endpoint, console))
             return
         from rich.live import Live
 
-        with Live(_view(seen, endpoint, console), console=console, screen=True, auto_refresh=False) as live:
+        with Live(view(seen, endpoint, console), console=console, screen=True, auto_refresh=False) as live:
             while not stop.wait(every_s):
-                live.update(_view(gauges.read(), endpoint, console), refresh=True)
+                live.update(view(indicators.read(), endpoint, console), refresh=True)
 
 
 def _console() -> Any:
@@ -78,7 +78,7 @@ def _can_redraw(console: Any) -> bool:
     return console.is_terminal and not console.is_dumb_terminal
 
 
-def _view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType":
+def view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType":
     from rich.console import Group
     from rich.text import Text
 

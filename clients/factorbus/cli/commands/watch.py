@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import require
-from factorbus.cli.process.exposure import insecure_option, refuse_open_page
+from factorbus.cli.process.bind_address import insecure_option, refuse_open_page
 from factorbus.cli.process.options import (
     Number,
     connect_option,

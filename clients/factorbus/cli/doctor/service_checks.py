@@ -17,42 +17,42 @@ def services(endpoint: str, zenoh: str) -> list[Finding]:
 
     try:
         with open_bus(endpoint, "doctor", zenoh, _WAIT_S) as bus:
-            return [finding(account) for account in bus.stats()]
+            return [finding(stats) for stats in bus.stats()]
     except Problem as problem:
         mend = "is it running (systemctl status factorbus)? with access control, only an operator may ask: give --zenoh"
         return [Finding("services", "fail", problem.message, mend)]
 
 
-def finding(account: Mapping[str, Any]) -> Finding:
-    """The worst that `account` tells of its service."""
-    name, maps = f"service {account['service']}", account["maps"]
+def finding(stats: Mapping[str, Any]) -> Finding:
+    """The worst that `stats` tells of its service."""
+    name, maps = f"service {stats['service']}", stats["maps"]
     told = ", ".join(f"{row['name']} ({counted(row['variables'], 'variable')})" for row in maps) or "no maps"
-    for state, seen, mend in _troubles(account):
+    for state, seen, mend in _troubles(stats):
         return Finding(name, state, f"{seen}; {told}", mend)
-    return Finding(name, "ok", f"alive, {told}, {counted(len(account.get('workers', ())), 'worker')}")
+    return Finding(name, "ok", f"alive, {told}, {counted(len(stats.get('workers', ())), 'worker')}")
 
 
-def _troubles(account: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+def _troubles(stats: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """(state, seen, mend), the worst first."""
-    if account["stuck"]:
-        seen = f"stuck: {', '.join(account['stuck'])}"
+    if stats["stuck"]:
+        seen = f"stuck: {', '.join(stats['stuck'])}"
         yield "fail", seen, "look into its log and restart it; WatchdogSec= in its systemd unit does so by itself"
-    for row in account.get("unopened", ()):
+    for row in stats.get("unopened", ()):
         mend = f"restore its folder from a copy and restart, or `factorbus drop {row['name']} --damaged` gives it up"
         yield "fail", f"map {row['name']} does not open ({row['state']}): {row['problem']}", mend
-    resident, limit = (account["memory"][name] for name in ("resident_bytes", "limit_bytes"))
+    resident, limit = (stats["memory"][name] for name in ("resident_bytes", "limit_bytes"))
     if resident > 0.9 * limit:
         state = "fail" if resident > limit else "warn"
         mend = "drop or move a map, or give it more (limits.memory_bytes): beyond the limit inserts are refused"
         yield state, f"{resident >> 20} MiB of memory, {limit >> 20} MiB allowed", mend
-    for row in account["maps"]:
+    for row in stats["maps"]:
         if why := row.get("journal", {}).get("problem"):
             yield "fail", why, "make room or make it writable: the map goes on by itself"
-    if not account["ready"]:
+    if not stats["ready"]:
         yield "warn", "alive, but not ready", "it is starting or stopping: look again"
-    if (version := account["version"]) != __version__:
+    if (version := stats["version"]) != __version__:
         yield "warn", f"version {version}, here it is {__version__}", "the same wire; update when it suits"
-    for row in account["maps"]:
+    for row in stats["maps"]:
         inserts = row["inserts"]
         if inserts["busy"] > 0.1 * max(inserts["accepted"], 10):
             mend = "clients send faster than it solves: insert less often, or spread maps over more services"

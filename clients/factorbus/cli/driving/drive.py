@@ -1,6 +1,6 @@
 """A stream of inserts into a map, measured: what `replay` and the demo's robot do.
 
-Where the map is (on the bus, in this process) is the target's business; both give the same account.
+Where the map is (on the bus, in this process) is the target's business; both give the same summary.
 """
 
 import time
@@ -100,7 +100,7 @@ class Target(Protocol):
         """All variables and factors, as they are now."""
         ...
 
-    def account(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """solver_cpu_s, kernels_compiled_s, deltas (received) and whatever else the target knows of itself."""
         ...
 

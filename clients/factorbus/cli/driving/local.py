@@ -79,7 +79,7 @@ class LocalMap:
             tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale) for g in factors),
         )
 
-    def account(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """CPU seconds of this thread in the solver, seconds of compiling."""
         return {"solver_cpu_s": self._cpu_s, "kernels_compiled_s": compile_seconds(), "deltas": None}
 

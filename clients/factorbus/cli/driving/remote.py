@@ -92,7 +92,7 @@ class RemoteMap:
         """The map's graph, from the service."""
         return self._map.graph(timeout_s=_ANSWER_S).batch
 
-    def account(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """What the service says of itself, and the deltas that came here of revisions that were waited for."""
         stats = self._map.stats(timeout_s=_ANSWER_S)
         return {
@@ -103,12 +103,12 @@ class RemoteMap:
 
     @property
     def reports(self) -> list[Mapping[str, Any]]:
-        """The account of every step whose delta came here, by revision."""
+        """The report of every step whose delta came here, by revision."""
         return [self._received[revision] for revision in sorted(self._received)]
 
     @property
     def latest(self) -> Mapping[str, Any]:
-        """The account of the last step whose delta came here; empty when there is none."""
+        """The report of the last step whose delta came here; empty when there is none."""
         return self._latest
 
     def wait_for(self, revision: int) -> None:

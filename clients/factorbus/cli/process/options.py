@@ -177,3 +177,15 @@ def ellipses_option(count: int) -> Callable[[F], F]:
         metavar="N",
         help="Draw 95 % ellipses of up to N poses and N points.",
     )
+
+
+def journal_option(command: F) -> F:
+    """--journal, of commands that read or write a folder of journals themselves."""
+    return click.option(
+        "--journal",
+        "folder",
+        type=click.Path(path_type=Path),
+        required=True,
+        metavar="DIR",
+        help="The folder that `factorbus serve` has.",
+    )(command)

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 from factorbus.proto import codec
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.config import Limits
-from factorbus.service.core.account import Account, InsertDone
 from factorbus.service.core.admission import Admission
 from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
@@ -38,15 +37,16 @@ from factorbus.service.core.events import (
     Verdict,
 )
 from factorbus.service.core.pending_questions import Reads
+from factorbus.service.core.statistics import InsertDone, MapStatistics
 from factorbus.service.questions.admin import MovedOn
 from factorbus.service.questions.answers import Question, parse
 
 _SNAPSHOT = Read(Question("snapshot"))
-# An InsertBatch is short when it is for one insert of at most _SHORT_BYTES and none of late took longer than _SHORT_S,
+# An InsertBatch is short when it is for one insert of at most _SHORT_BYTES and none of late took longer than SHORT_S,
 # unless the insert was already on its way when the last InsertBatch ended: then there are likely more behind it, to be
 # applied together.
 _SHORT_BYTES = 16 << 10
-_SHORT_S = 0.002
+SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
 
 
@@ -77,7 +77,7 @@ class MapCore:
         self._admission = Admission(epoch, limits)
         self._reads = Reads()
         self._running: InsertBatch | None = None
-        self._unjudged = self._unjudged_bytes = 0  # given to the solver, and not answered
+        self._unanswered = self._unanswered_bytes = 0  # given to the solver, and not answered
         self._must_reload = False
         self._started = self._ended = 0.0
         self._slowest_s = math.inf  # of late: forgotten by a tenth with every InsertBatch
@@ -85,7 +85,7 @@ class MapCore:
         self._drained = False
         self._since_snapshot = [0, 0]  # steps, bytes of deltas
         self._solver_cpu_s = 0.0
-        self._account = Account()
+        self._statistics = MapStatistics()
         self._converging = Converging()
         self._moved_at = 0  # the revision of the last step that was not a further one
 
@@ -117,19 +117,19 @@ class MapCore:
     def insert(self, arrived: Arrived) -> list[Effect]:
         """An insert came in."""
         if isinstance(arrived.content, ParsedInsert) and (run := self._try_alone(arrived, arrived.content)):
-            self._account.received(arrived.size)
+            self._statistics.received(arrived.size)
             return [run]
         effects = self._admission.expire(arrived.now)
-        judged = self._admission.admit(arrived)
-        self._account.received(arrived.size)
-        for effect in judged:
+        admitted = self._admission.admit(arrived)
+        self._statistics.received(arrived.size)
+        for effect in admitted:
             if isinstance(effect, Refuse):
-                self._account.refused(effect.problem)
-        return self._go_on(effects + judged, arrived.now)
+                self._statistics.refused(effect.problem)
+        return self._go_on(effects + admitted, arrived.now)
 
     def unread(self, client: str, refuse: Refuse) -> list[Effect]:
         """An insert of `client` came in of which not even the number can be read."""
-        self._account.refused(refuse.problem)
+        self._statistics.refused(refuse.problem)
         return [replace(refuse, following=self._admission.wanted(client))]
 
     def ask(self, arrived: ArrivedQuestion, now: float) -> list[Effect]:
@@ -153,17 +153,17 @@ class MapCore:
         self._reads.append(read)
         return self._go_on([], now)
 
-    def judged(self, judged: Verdict) -> list[Effect]:
+    def give_verdict(self, verdict: Verdict) -> list[Effect]:
         """The solver's word on some of what it has."""
         effects: list[Effect] = []
-        self._unjudged -= len(judged.outcomes)
-        for outcome in judged.outcomes:
-            self._unjudged_bytes -= outcome.insert.size
+        self._unanswered -= len(verdict.outcomes)
+        for outcome in verdict.outcomes:
+            self._unanswered_bytes -= outcome.insert.size
             effects += self._admission.answer(outcome.insert, outcome.answer)
             if isinstance(outcome.answer, bytes):
-                self._account.accepted(len(outcome.answer))
+                self._statistics.accepted(len(outcome.answer))
             else:
-                self._account.refused(outcome.answer)
+                self._statistics.refused(outcome.answer)
         return effects
 
     def alone(self, alone: SingleInsertResult, answered: Asker) -> list[Effect]:
@@ -171,10 +171,10 @@ class MapCore:
         (insert, answer, _), stepped, applied = alone
         size = len(stepped.delta)
         others = self._admission.answer(insert, answer, answered)
-        self._unjudged -= 1
-        self._unjudged_bytes -= insert.size
-        told = stepped.strategy, stepped.chi2, stepped.solver_ms
-        self._account.note(InsertDone(*told, applied.now - insert.now, len(answer), size))
+        self._unanswered -= 1
+        self._unanswered_bytes -= insert.size
+        step = stepped.strategy, stepped.chi2, stepped.solver_ms
+        self._statistics.note(InsertDone(*step, applied.now - insert.now, len(answer), size))
         self._moved_on(stepped.revision, size)
         self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2)
         self._moved_at = stepped.revision
@@ -185,7 +185,7 @@ class MapCore:
         """What came of an InsertBatch is written down."""
         effects: list[Effect] = []
         for event in events:
-            effects += self.judged(event) if isinstance(event, Verdict) else self.stepped(event)
+            effects += self.give_verdict(event) if isinstance(event, Verdict) else self.stepped(event)
         return self._go_on(effects, now)
 
     def block(self, problem: Problem, now: float) -> list[Effect]:
@@ -198,7 +198,7 @@ class MapCore:
         """The same, and what came of Runs since the last `kept` did not happen: the solver is to go back."""
         self._admission.block(problem)
         effects = self._count_refused(self._admission.take_back(problem, given=True))
-        self._unjudged = self._unjudged_bytes = 0
+        self._unanswered = self._unanswered_bytes = 0
         self._converging.undone()
         self._must_reload = True
         return self._go_on([*effects, self._event("blocked")], now)
@@ -214,14 +214,14 @@ class MapCore:
         """The map was here before: what its clients have sent, and how it is."""
         for name, following, answered in senders:
             self._admission.restore(name, following, answered, self._created)
-        self.revision, self.variables, self.factors, self._account.chi2 = restored[:4]
+        self.revision, self.variables, self.factors, self._statistics.chi2 = restored[:4]
         self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2)
         self._moved_at, self.differs = restored.revision, restored.differs
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
         size = len(stepped.delta)
-        self._account.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, size)
+        self._statistics.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, size)
         self._moved_on(stepped.revision, size)
         if stepped.further:
             self._converging.went_on(stepped)
@@ -243,7 +243,7 @@ class MapCore:
         """The solver is free again."""
         taken = self._running.inserts if self._running else ()
         for insert in taken:
-            self._account.took(applied.now - insert.now)
+            self._statistics.took(applied.now - insert.now)
         if applied.refused:
             self._converging.refused()
         self._free(applied, len(taken))
@@ -264,14 +264,14 @@ class MapCore:
         for insert in self._running.inserts if self._running else ():
             if self._admission.is_open(insert):
                 effects += self._admission.answer(insert, problem)
-                self._unjudged -= 1
-                self._unjudged_bytes -= insert.size
+                self._unanswered -= 1
+                self._unanswered_bytes -= insert.size
         self._running = None
         return self._go_on(effects, now)
 
     def tick(self, now: float) -> list[Effect]:
         """Time went by."""
-        self._account.count()
+        self._statistics.count()
         self._converging.look(now)
         return self._go_on(self._admission.expire(now), now)
 
@@ -285,7 +285,7 @@ class MapCore:
 
         Raises MovedOn.
         """
-        waiting = self._unjudged + self._admission.ready + self._admission.parked
+        waiting = self._unanswered + self._admission.ready + self._admission.parked
         if not self._moved_at <= revision <= self.revision or waiting:
             raise MovedOn(self.name, self.revision, revision, waiting)
 
@@ -302,21 +302,21 @@ class MapCore:
             "uptime_s": now - self._created,
             "waiting": self._admission.ready,
             "parked": self._admission.parked,
-            "unwritten": self._unjudged - (len(self._running.inserts) if self._running else 0),
+            "unwritten": self._unanswered - (len(self._running.inserts) if self._running else 0),
             "in_solver": len(self._running.inserts) if self._running else 0,
             "clients": self._admission.next_sequences,
             "steps": self.revision,
             "further_steps": self._converging.steps,
             "gave_up": self._converging.gave_up,
             "solver_cpu_s": self._solver_cpu_s,
-            **self._account.stats(),
+            **self._statistics.stats(),
         }
 
-    def account(self, now: float) -> dict[str, Any]:
+    def operator_stats(self, now: float) -> dict[str, Any]:
         """What admin/stats says of this map: `stats`, with what only an operator asks for."""
         return self.stats(now) | {
             "clients": len(self._admission.next_sequences),
-            **self._account.for_operators(),
+            **self._statistics.for_operators(),
         }
 
     def running_s(self, now: float) -> float:
@@ -337,24 +337,24 @@ class MapCore:
             if inserts or further:
                 self._converging.began(further)
             self._must_reload = False
-            self._unjudged += len(inserts)
-            self._unjudged_bytes += sum([insert.size for insert in inserts])
+            self._unanswered += len(inserts)
+            self._unanswered_bytes += sum([insert.size for insert in inserts])
             self._started = now
             effects.append(self._running)
-        elif self._closing is not None and not self._drained and not self._unjudged:
+        elif self._closing is not None and not self._drained and not self._unanswered:
             self._drained = True
             effects.append(Drained())
         return effects
 
     def _may_go_on(self, now: float) -> bool:
         """May the solver take a further step?  Inserts come first, and nothing is left to be told or written."""
-        waits = self._admission.ready or self._unjudged or self._must_reload
+        waits = self._admission.ready or self._unanswered or self._must_reload
         stopped = self._admission.blocked or self._closing is not None
         return not waits and not stopped and self._converging.is_due(now)
 
     def _has_room(self) -> bool:
         """May the solver have more, or has the journal to write first?"""
-        return self._unjudged < self._limits.unwritten and self._unjudged_bytes < self._limits.waiting_bytes
+        return self._unanswered < self._limits.unwritten and self._unanswered_bytes < self._limits.waiting_bytes
 
     def _try_alone(self, arrived: Arrived, content: ParsedInsert) -> InsertBatch | None:
         """The short InsertBatch of this insert and nothing else, if that is what `_go_on` would come to."""
@@ -372,8 +372,8 @@ class MapCore:
             return None
         self._started = arrived.now
         self._converging.began(False)
-        self._unjudged += 1
-        self._unjudged_bytes += arrived.size
+        self._unanswered += 1
+        self._unanswered_bytes += arrived.size
         self._running = run = InsertBatch((), (arrived,), True)
         return run
 
@@ -386,12 +386,12 @@ class MapCore:
         return not (inserts[0].is_change or content.convert_below or content.settle)
 
     def _is_quick(self, size: int, now: float) -> bool:
-        return size <= _SHORT_BYTES and self._slowest_s <= _SHORT_S and now - self._ended >= _ROUND_TRIP_S
+        return size <= _SHORT_BYTES and self._slowest_s <= SHORT_S and now - self._ended >= _ROUND_TRIP_S
 
     def _count_refused(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
             if isinstance(effect, Refuse):
-                self._account.refused(effect.problem)
+                self._statistics.refused(effect.problem)
         return effects
 
     def _event(self, what: str) -> Publish:

@@ -122,7 +122,7 @@ class FeatureQuestions:
             work, rates = work_of(ask), self._rates or self.measure()
             count = shards_for(work, rates, self._latencies.known, self._jobs.slots("idp"))
             if count == 0:
-                self._here(asker, payload, ask.sighting.count)
+                self._here(asker, payload, ask.observations.count)
                 return
         except Problem as problem:
             self._refuse(asker, problem)

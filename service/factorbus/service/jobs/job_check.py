@@ -118,13 +118,13 @@ def _check_features(payload: bytes, answer: bytes) -> None:
             raise WrongAnswer(f"answered {seen} {name}; wanted {' × '.join(map(str, shape))}")
     if not all(np.isfinite(array).all() for array, _ in parts.values()):
         raise DoubtfulAnswer("answered features with numbers that are not finite")
-    if (done.y[:, :3] != ask.sighting.state[:3]).any() or (done.y[:, 5] != ask.sighting.rho).any():
+    if (done.y[:, :3] != ask.observations.state[:3]).any() or (done.y[:, 5] != ask.observations.rho).any():
         raise WrongAnswer("answered features of another camera, or with another prior of ρ")
 
 
 def _parts(ask: Ask, done: ShardDone) -> dict[str, tuple[Any, tuple[int, ...]]]:
     """By name the arrays that an answer in this form has, and their shapes."""
-    n, m, k = ask.sighting.count, ask.sighting.width, done.last - done.first
+    n, m, k = ask.observations.count, ask.observations.width, done.last - done.first
     blocks = sum(FEATURE * FEATURE * (n - i) for i in range(done.first, done.last))
     by_form = {
         "rows": {"rows": (FEATURE * k, m + FEATURE * n)},

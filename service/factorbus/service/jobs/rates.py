@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import CAMERA_STATE, Ask, Shard, Sighting, answer_size, new_rows_size
+from factorbus.proto.features import CAMERA_STATE, Ask, Observations, Shard, answer_size, new_rows_size
 from factorbus.proto.features_codec import encode_ask, encode_shard
 from factorbus.proto.segments import PAGE, Memory
 from factorbus.service.jobs.sharding import Rates
@@ -38,19 +38,19 @@ def example(form: str, n: int) -> Ask:
     state[3] = 1.0
     pixels = np.stack([np.linspace(50.0, 590.0, n), np.linspace(400.0, 60.0, n)], axis=1)
     camera = Camera("radtan", (500.0, 500.0, 320.0, 240.0, -0.1, 0.01, 0.0, 0.0), 640, 480)
-    return Ask(Sighting(camera, state, 1e-4 * np.eye(CAMERA_STATE), pixels), form)
+    return Ask(Observations(camera, state, 1e-4 * np.eye(CAMERA_STATE), pixels), form)
 
 
 def _stored(do: Callable[[bytes], bytes], ask: Ask) -> float:
     """Seconds of an answer through fresh shared memory; 0 where there is none."""
-    n, best = ask.sighting.count, 0.0
+    n, best = ask.observations.count, 0.0
     for _ in range(_TIMES):
         try:
             memory = Memory(PAGE + new_rows_size(n, CAMERA_STATE))
         except OSError:
             return 0.0
         with memory:
-            payload = _whole(encode_ask(Ask(ask.sighting, "rows", memory.segment(PAGE))), n)
+            payload = _whole(encode_ask(Ask(ask.observations, "rows", memory.segment(PAGE))), n)
             took = _timed(lambda payload=payload: do(payload))
         best = min(best or took, took)
     return best

@@ -41,8 +41,8 @@ class Work:
 def work_of(ask: Ask) -> Work:
     """The work that a question is."""
     stored = ask.form == "rows" and ask.segment is not None
-    numbers = new_rows_size(ask.sighting.count, ask.sighting.width) if stored else answer_size(ask)
-    return Work(ask.sighting.count, answer_size(ask), numbers // 8, stored)
+    numbers = new_rows_size(ask.observations.count, ask.observations.width) if stored else answer_size(ask)
+    return Work(ask.observations.count, answer_size(ask), numbers // 8, stored)
 
 
 def seconds(work: Work, rates: Rates, shards: int = 1) -> float:
@@ -68,12 +68,12 @@ def shards_for(work: Work, rates: Rates, latencies: Sequence[RoundTrip], slots: 
 
 def cuts(ask: Ask, shards: int) -> list[tuple[int, int]]:
     """(first, last) of each shard: as many rows for each; in the form `half`, as many blocks."""
-    n = ask.sighting.count
+    n = ask.observations.count
     if ask.form != "half":
         edges = [n * k // shards for k in range(shards + 1)]
     else:
         edges = [0]
-        row_bytes = 6 * ask.sighting.width
+        row_bytes = 6 * ask.observations.width
         share = (row_bytes * n + FEATURE * FEATURE * n * (n + 1) // 2) / shards
         done = 0
         for i in range(n):

@@ -28,10 +28,10 @@ def written(
     return JournalRecord(number, revision, rebuilt, present, entries, further and not rebuilt)
 
 
-def _entry(insert: Arrived, outcome: Outcome, judged: Verdict) -> Entry:
+def _entry(insert: Arrived, outcome: Outcome, verdict: Verdict) -> Entry:
     if isinstance(outcome.answer, bytes):
-        answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, outcome.answer
+        answer = ACCEPTED, verdict.revision, outcome.first_factor, verdict.together, outcome.answer
     else:
         tried = REFUSED if isinstance(outcome.answer, SolverError) else UNTRIED
-        answer = tried, judged.revision, -1, 0, codec.encode_problem(outcome.answer)
+        answer = tried, verdict.revision, -1, 0, codec.encode_problem(outcome.answer)
     return sealed(Entry(insert.client, insert.sequence, 0, *answer, insert.message))

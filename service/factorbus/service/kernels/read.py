@@ -1,6 +1,6 @@
 """An insert that only adds, read where it lies: where its columns are, instead of the columns.
 
-It reads what the wire's words say, each field once, in any order and in any form that MessagePack has for it.  Whatever
+It reads what the wire's tokens say, each field once, in any order and in any form that MessagePack has for it. Whatever
 else it finds (changes of what is there, fields of a later version, anything wrong) it leaves to `codec.decode_insert`,
 which takes more, and says what is wrong with the rest.  What it accepts, that accepts, with the same content.
 """
@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
-from factorbus.service.kernels import words as w
+from factorbus.service.kernels import wire_tokens as w
 from factorbus.service.kernels.compile import I64, inline_kernel, kernel, part
 from factorbus.service.kernels.digest import digest_bytes
-from factorbus.service.kernels.words import LONGEST, WORDS, look_up
+from factorbus.service.kernels.wire_tokens import LONGEST, TOKENS, look_up
 from factorbus.solver.kernels.graph import group_table as gt
 
 # In place of where to read on: this is left to the codec.
@@ -43,7 +43,7 @@ def locate_insert(raw: bytes, groups: I64) -> tuple:
         if here < 0 or seen >> row & 1:
             return 0, 0, False, 0.0, 0, 0, 0
         seen |= 1 << row
-        field = WORDS[row, w.W_CODE]
+        field = TOKENS[row, w.W_CODE]
         if field == w.SEQUENCE:
             sequence, here = read_integer(raw, here)
         elif field == w.EPOCH:
@@ -84,13 +84,13 @@ def read_group(raw: bytes, here: int, factors: int, group: I64) -> int:
         if here < 0 or seen >> row & 1:
             return _LOST
         seen |= 1 << row
-        field = WORDS[row, w.W_CODE]
+        field = TOKENS[row, w.W_CODE]
         if field == w.KIND:
             kind, here = read_word(raw, here, w.FACTOR_KIND if factors else w.VARIABLE_KIND)
         elif field == w.FIXED:
             fixed, here = read_flag(raw, here)
         elif is_nil(raw, here):
-            if WORDS[row, w.W_NIL] == 0:
+            if TOKENS[row, w.W_NIL] == 0:
                 return _LOST
             here += 1
         elif field == w.LOSS:
@@ -101,15 +101,15 @@ def read_group(raw: bytes, here: int, factors: int, group: I64) -> int:
             return _LOST
     if here < 0 or kind < 0 or at[w.KEYS] < 0:
         return _LOST
-    count = size[w.KEYS] // (8 * WORDS[kind, w.W_ARITY])
+    count = size[w.KEYS] // (8 * TOKENS[kind, w.W_ARITY])
     for field in range(w.GROUP_FIELDS):
         if at[field] >= 0 and size[field] != 8 * count * numbers_of(field, kind):
             return _LOST
     if factors and (at[w.NUMBERS] < 0 or at[w.INFORMATION] < 0 or (at[w.SCALE] >= 0) != (loss >= 0)):
         return _LOST
-    group[gt.G_KIND], group[gt.G_FACTORS], group[gt.G_COUNT] = WORDS[kind, w.W_CODE], factors, count
+    group[gt.G_KIND], group[gt.G_FACTORS], group[gt.G_COUNT] = TOKENS[kind, w.W_CODE], factors, count
     group[gt.G_FIXED], group[gt.G_LIMITED] = 1 if fixed else 0, 0
-    group[gt.G_LOSS] = WORDS[loss, w.W_CODE] if loss >= 0 else 0
+    group[gt.G_LOSS] = TOKENS[loss, w.W_CODE] if loss >= 0 else 0
     group[gt.G_KEYS], group[gt.G_NUMBERS], group[gt.G_STAMPS] = at[w.KEYS], at[w.NUMBERS], at[w.STAMPS]
     group[gt.G_INFORMATION], group[gt.G_SCALE] = at[w.INFORMATION], at[w.SCALE]
     return here
@@ -119,10 +119,10 @@ def read_group(raw: bytes, here: int, factors: int, group: I64) -> int:
 def numbers_of(field: int, kind: int) -> int:
     """How many numbers a column has for each row, of the kind in this row of the table."""
     if field == w.KEYS:
-        return WORDS[kind, w.W_ARITY]
+        return TOKENS[kind, w.W_ARITY]
     if field == w.NUMBERS:
-        return WORDS[kind, w.W_SIZE]
-    return WORDS[kind, w.W_TRIANGLE] if field == w.INFORMATION else 1
+        return TOKENS[kind, w.W_SIZE]
+    return TOKENS[kind, w.W_TRIANGLE] if field == w.INFORMATION else 1
 
 
 @part
@@ -141,7 +141,7 @@ def read_count(raw: bytes, here: int, short: int, long: int) -> tuple:
 
 @part
 def read_word(raw: bytes, here: int, role: int) -> tuple:
-    """(row in the table, where to read on) of a string that is one of the words of a role."""
+    """(row in the table, where to read on) of a string that is one of the tokens of a role."""
     if not 0 <= here < len(raw):
         return -1, _LOST
     first = np.int64(raw[here])

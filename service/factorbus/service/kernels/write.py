@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from factorbus.service.kernels import words as w
+from factorbus.service.kernels import wire_tokens as w
 from factorbus.service.kernels.compile import I64, U8, inline_kernel, kernel, part
-from factorbus.service.kernels.words import LETTERS, WORDS
+from factorbus.service.kernels.wire_tokens import LETTERS, TOKENS
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph, graph_at
 
@@ -58,9 +58,9 @@ def count_groups(changed: I64, graph: Graph) -> tuple:
     """(how many there are of each kind, those that are not fixed before those that are; how many of them have a time
     stamp; bytes of their columns)."""
     kinds = 0
-    for row in range(WORDS.shape[0]):
-        if WORDS[row, w.W_ROLE] == w.VARIABLE_KIND:
-            kinds = max(kinds, WORDS[row, w.W_CODE] + 1)
+    for row in range(TOKENS.shape[0]):
+        if TOKENS[row, w.W_ROLE] == w.VARIABLE_KIND:
+            kinds = max(kinds, TOKENS[row, w.W_CODE] + 1)
     var, stamps = graph.var, graph.stamps
     groups, stamped, size = np.zeros(2 * kinds, np.int64), np.zeros(2 * kinds, np.int64), 0
     for n in range(changed.size):
@@ -69,7 +69,7 @@ def count_groups(changed: I64, graph: Graph) -> tuple:
         stamped[group] += 1 if stamps[changed[n]] != at.NO_STAMP else 0
     for group in range(groups.size):
         if groups[group] > 0:
-            columns = 1 + WORDS[w.row_of_variables(group // 2), w.W_SIZE] + (1 if stamped[group] > 0 else 0)
+            columns = 1 + TOKENS[w.row_of_variables(group // 2), w.W_SIZE] + (1 if stamped[group] > 0 else 0)
             size += 8 * groups[group] * columns
     return groups, stamped, size
 
@@ -84,10 +84,10 @@ def write_variables(out: U8, here: int, groups: I64, stamped: I64, changed: I64,
         if count == 0:
             continue
         row = w.row_of_variables(group // 2)
-        size, fixed = WORDS[row, w.W_SIZE], group % 2
+        size, fixed = TOKENS[row, w.W_SIZE], group % 2
         out[here] = 0x83 + fixed + (1 if stamped[group] > 0 else 0)
         here = write_piece(out, here + 1, w.P_KIND)
-        out[here] = 0xA0 + WORDS[row, w.W_LENGTH]
+        out[here] = 0xA0 + TOKENS[row, w.W_LENGTH]
         here = write_piece(out, here + 1, row)
         here = write_bin_head(out, write_piece(out, here, w.P_KEYS), 8 * count)
         for n in range(changed.size):
@@ -117,7 +117,7 @@ def label_of_variable(variable: int, var: I64) -> int:
 @part
 def write_piece(out: U8, here: int, row: int) -> int:
     """What is in a row of the table."""
-    return write_bytes(out, here, LETTERS, WORDS[row, w.W_START], WORDS[row, w.W_LENGTH])
+    return write_bytes(out, here, LETTERS, TOKENS[row, w.W_START], TOKENS[row, w.W_LENGTH])
 
 
 @part

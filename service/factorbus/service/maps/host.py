@@ -140,10 +140,10 @@ class Host:
             effects = self.core.tick(time.monotonic())
         self._perform(effects)
 
-    def account(self) -> dict[str, Any]:
+    def operator_stats(self) -> dict[str, Any]:
         """What admin/stats says of the map."""
         with self._lock:
-            return self.core.account(time.monotonic()) | self.journal()
+            return self.core.operator_stats(time.monotonic()) | self.journal()
 
     def silent_s(self) -> float:
         """For how long the solver has not come to its next work, whichever thread it is on."""
@@ -269,7 +269,7 @@ class Host:
                 if isinstance(event, Verdict):
                     # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
                     # measured: an answer sent before its delta is encoded makes the delta 0.2 ms later.
-                    effects += self.core.judged(event)
+                    effects += self.core.give_verdict(event)
                     continue
                 effects += self.core.stepped(event)
             tell(effects)

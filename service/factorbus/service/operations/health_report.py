@@ -1,4 +1,4 @@
-"""What the service knows of itself: is it alive, is there memory, and the account that an operator reads."""
+"""What the service knows of itself: is it alive, is there memory, and the report that an operator reads."""
 
 import os
 import time
@@ -12,7 +12,7 @@ from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.process.health import Health, Pulse, Signs
 from factorbus.service.process.memory import MemoryLimit
 
-# What others have to say in the account, by name: a function for each, called on any thread.
+# What others have to say in the report, by name: a function for each, called on any thread.
 Chapters = dict[str, Callable[[], Any]]
 
 
@@ -47,7 +47,7 @@ class HealthReport:
         )
         return {name for name, seconds in solvers.items() if seconds > self.health.stuck_s}
 
-    def account(self) -> dict[str, Any]:
+    def read(self) -> dict[str, Any]:
         """What admin/stats says, and what the metrics are made of."""
         from factorbus.service.operations.warm import seconds_compiling
 
@@ -63,6 +63,6 @@ class HealthReport:
             "silent_s": self.health.silent_s(),
             "memory": {"resident_bytes": self.memory.resident, "limit_bytes": self.memory.limit},
             "kernels_compiled_s": seconds_compiling(),
-            "maps": [host.account() for host in self._hosts().values()],
-            **{name: read() for name, read in self.chapters.items()},
+            "maps": [host.operator_stats() for host in self._hosts().values()],
+            **{name: more() for name, more in self.chapters.items()},
         }

@@ -1,4 +1,4 @@
-"""The account as Prometheus metrics, and the two questions of an orchestrator, over HTTP.
+"""The health report as Prometheus metrics, and the two questions of an orchestrator, over HTTP.
 
     /metrics   all that admin/stats says, in the text format of Prometheus
     /live      200 while no thread is stuck, else 503, with the names of those that are
@@ -75,26 +75,26 @@ class Family(NamedTuple):
     samples: list[tuple[tuple[str, ...], Any]]
 
 
-def families(account: Mapping[str, Any]) -> Iterator[Family]:
-    """The metrics that `account` comes to.  A counter's name has no _total yet."""
+def families(health: Mapping[str, Any]) -> Iterator[Family]:
+    """The metrics that `health` comes to.  A counter's name has no _total yet."""
     yield _one(
-        "info", "gauge", "1, with who and which version", 1.0, service=account["service"], version=account["version"]
+        "info", "gauge", "1, with who and which version", 1.0, service=health["service"], version=health["version"]
     )
-    yield _one("uptime_seconds", "gauge", "Since the service began", account["uptime_s"])
-    yield _one("alive", "gauge", "1 while no thread is stuck", account["alive"])
-    yield _one("ready", "gauge", "1 while it is alive and takes inserts", account["ready"])
-    yield _one("memory_bytes", "gauge", "Resident memory of the process", account["memory"]["resident_bytes"])
-    yield _one("memory_limit_bytes", "gauge", "From here on inserts are refused", account["memory"]["limit_bytes"])
+    yield _one("uptime_seconds", "gauge", "Since the service began", health["uptime_s"])
+    yield _one("alive", "gauge", "1 while no thread is stuck", health["alive"])
+    yield _one("ready", "gauge", "1 while it is alive and takes inserts", health["ready"])
+    yield _one("memory_bytes", "gauge", "Resident memory of the process", health["memory"]["resident_bytes"])
+    yield _one("memory_limit_bytes", "gauge", "From here on inserts are refused", health["memory"]["limit_bytes"])
     yield _by(
-        "silent_seconds", "gauge", "How long a thread has not come to its next work", "thread", account["silent_s"]
+        "silent_seconds", "gauge", "How long a thread has not come to its next work", "thread", health["silent_s"]
     )
-    cores = account.get("cores", {"used": 1, "pieces": 0})
+    cores = health.get("cores", {"used": 1, "pieces": 0})
     yield _one("cores", "gauge", "Cores that one elimination may be at work on", cores["used"])
     yield _one("pieces", "counter", "Pieces of eliminations made on other cores than the map's own", cores["pieces"])
-    yield from _of_workers(account.get("workers", ()))
-    yield from _of_maps(account["maps"])
-    yield _one("maps_unopened", "gauge", "Maps on disk that do not open", len(account.get("unopened", ())))
-    yield from _extra("journal", "", {"": account.get("journal", {})})
+    yield from _of_workers(health.get("workers", ()))
+    yield from _of_maps(health["maps"])
+    yield _one("maps_unopened", "gauge", "Maps on disk that do not open", len(health.get("unopened", ())))
+    yield from _extra("journal", "", {"": health.get("journal", {})})
 
 
 def _of_workers(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
@@ -181,7 +181,7 @@ class _Collector:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
         kinds = {"gauge": GaugeMetricFamily, "counter": CounterMetricFamily, "histogram": HistogramMetricFamily}
-        for family in families(self._health_report.account()):
+        for family in families(self._health_report.read()):
             made = kinds[family.kind](f"factorbus_{family.name}", family.help, labels=family.labels)
             for labels, value in family.samples:
                 if family.kind == "histogram":

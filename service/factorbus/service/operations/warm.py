@@ -41,8 +41,8 @@ def warm_service(progress: Callable[[str], None] | None = None) -> float:
     `progress` is called with the name of each kernel that is compiled, before it is.
     """
     started = time.monotonic()
-    if missing := _list_missing():
-        _share_out(min(core_count(), _MOST, -(-len(missing) // _FEW)), progress)
+    if missing := missing_kernels():
+        share_out(min(core_count(), _MOST, -(-len(missing) // _FEW)), progress)
         _apart.append(time.monotonic() - started)
     solver.warm()
     warm_idp()
@@ -55,7 +55,7 @@ def seconds_compiling() -> float:
     return solver.compile_seconds() + sum(_apart)
 
 
-def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
+def share_out(processes: int, progress: Callable[[str], None] | None) -> None:
     """Compile what is missing in other processes.  One that fails leaves its kernels to the process that needs them."""
     told, tell = os.pipe()
     with tempfile.TemporaryDirectory(prefix="factorbus-warm-") as claims, ExitStack() as stack:
@@ -74,17 +74,17 @@ def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
                 progress(name.strip())
 
 
-def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
+def take_turns(claims: Path, progress: Callable[[str], None]) -> None:
     """Compile one kernel after the other that nobody has claimed."""
-    _look_less()
-    kernels = {f"{kernel.__module__}.{kernel.__name__}": kernel for kernel in _list_missing()}
+    collect_garbage_less()
+    kernels = {f"{kernel.__module__}.{kernel.__name__}": kernel for kernel in missing_kernels()}
     for name in CompileSplit(claims, {name: functions_of(kernel) for name, kernel in kernels.items()}):
         progress(kernels[name].__name__)
         for _ in iter_compile(kernels[name]):
             pass
 
 
-def _look_less() -> None:
+def collect_garbage_less() -> None:
     """To look for what the compiler has dropped takes a tenth of the time; done rarely, half of that.  Where there is
     memory for all of it, it is not done."""
     if available() >= _PLENTY * min(core_count(), _MOST):
@@ -93,12 +93,12 @@ def _look_less() -> None:
         gc.set_threshold(20_000, 20, 1000)
 
 
-def _tell(name: str) -> None:
+def print_name(name: str) -> None:
     """In one piece, whatever the buffering: others write to the same pipe."""
     os.write(sys.stdout.fileno(), f"{name}\n".encode())
 
 
-def _list_missing() -> list:
+def missing_kernels() -> list:
     return list_missing() + list_missing(idp_kernels, kernels)
 
 
@@ -110,4 +110,4 @@ def _end(process: subprocess.Popen) -> None:
 
 if __name__ == "__main__":
     with suppress(FileNotFoundError, BrokenPipeError, KeyboardInterrupt):  # the process that started this has gone
-        _take_turns(Path(sys.argv[1]), _tell)
+        take_turns(Path(sys.argv[1]), print_name)

@@ -51,7 +51,7 @@ class WorkerThreads:
         for thread in self._threads:
             thread.start()
 
-    def account(self) -> dict[str, Any]:
+    def counts(self) -> dict[str, Any]:
         """How many that is, with the one that a map's own thread has; pieces of eliminations that the others made."""
         return {"used": 1 + len(self._threads), "pieces": sum(worker.made for worker in self._workers)}
 

@@ -128,11 +128,11 @@ def snapshot(
     epoch: int,
     revision: int,
     questions: Sequence[Question],
-    account: Mapping[str, Any],
+    reported: Mapping[str, Any],
     uncertain: Uncertain | None = None,
     room: Room = _UNBOUNDED,
 ) -> QuestionCopies:
-    """What `questions` need of `solver`, copied.  account: of its last step.  uncertain: R, if it is copied already.
+    """What `questions` need of `solver`, copied.  reported: of its last step.  uncertain: R, if it is copied already.
 
     room: what has no room is refused by itself.
     """
@@ -148,11 +148,11 @@ def snapshot(
     view = solver.covariances.try_view() if any(near_variables(question.ask) for question in asked) else None
     near = [question for question in asked if view is not None and near_variables(question.ask)]
     if view is not None:
-        here = Uncertain(lambda: view, epoch, revision, True, account, room)
+        here = Uncertain(lambda: view, epoch, revision, True, reported, room)
         ready |= {id(question): _answer_or_problem(here, question) for question in near}
     if uncertain is None and len(near) < len(asked):
         keeps_steps = view is not None or solver.covariances.try_view() is not None
-        uncertain = Uncertain(solver.covariances.factoring(), epoch, revision, keeps_steps, account, room)
+        uncertain = Uncertain(solver.covariances.factoring(), epoch, revision, keeps_steps, reported, room)
     content = solver.content() if "repair" in names else None
     groups = as_variables(variables), as_factors(factors)
     return QuestionCopies(epoch, revision, *groups, chi2, uncertain, ready, content, room=room)

@@ -14,6 +14,8 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 _NUMBER = 8
 # Of a candidate beside its blocks: keys, measurement, information, row of the graph, what is told of it.
 _OF_A_CANDIDATE = 1024
+# Of a block beside its numbers: the variable's row, key and kind, and their copies; measured, 137 in the plane.
+_OF_A_BLOCK = 160
 # Blocks of a candidate, as wide as the largest variable: of both ends, between them, H Σ Hᵀ, and copies of these.
 _BLOCKS = 8
 
@@ -45,7 +47,8 @@ def of_blocks(blocks: CovarianceBlocks, variables: I64) -> Cost:
     dims, width = blocks.factored.dims, blocks.width
     answer = _NUMBER * int((dims[variables] ** 2 + 1).sum())
     whole = 2 * blocks.factored.count if blocks.prefers_all(variables.size) else 0
-    return Cost(answer, _NUMBER * width * width * (whole + variables.size) + COPIES * answer)
+    memory = _NUMBER * width * width * (whole + variables.size) + _OF_A_BLOCK * variables.size
+    return Cost(answer, memory + COPIES * answer)
 
 
 def of_candidates(blocks: CovarianceBlocks, count: int, numbers: int) -> Cost:

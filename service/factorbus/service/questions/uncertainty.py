@@ -35,9 +35,9 @@ from factorbus.solver.kernels.model import layout as at
 # Measured on city10000: a path to the root takes 0.1 ms, a copy of R 5 ms.
 NEAR = 8  # variables of the questions that are answered, between two steps, from R where it lies
 _ENDS = 2  # of a factor, at most
-_MOST = 100_000  # candidates, or pairs of sighting and landmark, in one question: some 100 MB of Jacobians
+_MOST = 100_000  # candidates, or pairs of observation and landmark, in one question: some 100 MB of Jacobians
 _MOST_FACTORS = 10_000  # of a variable that is asked about: some seconds
-_OF_AN_ACCOUNT = 100  # numbers that an account of a factor comes to, with its names, at most
+_OF_AN_EXPLANATION = 100  # numbers that the explanation of a factor comes to, with its names, at most
 _SMALLEST = min(kind.dim for kind in VARIABLE_KINDS.values())
 _UNBOUNDED = Room()
 
@@ -92,8 +92,8 @@ class NoPose(Problem):
 class Uncertain:
     """R at one revision.  Threads take turns: candidates are put into the graph, and taken out again.
 
-    make: gives R, when the first answer needs it.  keeps_steps: the solver notes when each variable moved.  account: of
-    the last step.  room: for answers.
+    make: gives R, when the first answer needs it.  keeps_steps: the solver notes when each variable moved.  reported:
+    of the last step.  room: for answers.
     """
 
     def __init__(
@@ -102,13 +102,13 @@ class Uncertain:
         epoch: int,
         revision: int,
         keeps_steps: bool,
-        account: Mapping[str, Any],
+        reported: Mapping[str, Any],
         room: Room = _UNBOUNDED,
     ) -> None:
         self._make, self._room = make, room
         self._made: CovarianceBlocks | None = None
         self._when = epoch, revision
-        self._keeps_steps, self._account = keeps_steps, account
+        self._keeps_steps, self._last_report = keeps_steps, reported
         self._turn = threading.Lock()
 
     @property
@@ -161,7 +161,7 @@ class Uncertain:
         pose = int(self._find(np.array([ask.pose]))[0])
         landmarks = self._landmarks(ask.kind) if ask.landmarks is None else self._find(np.unique(ask.landmarks))
         pairs = len(ask.measured) * landmarks.size
-        _check_size("the question", pairs, _MOST, "pairs of sighting and landmark")
+        _check_size("the question", pairs, _MOST, "pairs of observation and landmark")
         self._afford(costs.of_candidates(self._blocks, pairs, 3), taken)
 
         def weigh(variables: I64, numbers: int) -> None:
@@ -181,7 +181,7 @@ class Uncertain:
                 found.dims,
                 allowed,
                 found.complete,
-                found.sightings,
+                found.observations,
                 self._graph.keys[found.landmarks],
                 found.distances,
             )
@@ -194,12 +194,12 @@ class Uncertain:
         if ask.key is not None:
             index = int(self._find(np.array([ask.key]))[0])
             count = self._graph.count_factors(index)
-            _check_size("the account of this variable", count, _MOST_FACTORS, "factors")
-            self._afford(costs.of_candidates(self._blocks, count, _OF_AN_ACCOUNT), taken)
+            _check_size("the explanation of this variable", count, _MOST_FACTORS, "factors")
+            self._afford(costs.of_candidates(self._blocks, count, _OF_AN_EXPLANATION), taken)
             variable = why_variable(self._blocks, index, self._keeps_steps).as_dict()
         elif ask.factor is not None:
             factor = why_factor(self._blocks, ask.factor).as_dict()
-        return asking_codec.encode_why(Why(*self._when, variable, factor, self._account))
+        return asking_codec.encode_why(Why(*self._when, variable, factor, self._last_report))
 
     def _judge(self, factors: Sequence[Factors], numbers: int, taken: Taken) -> Candidates:
         """Without their losses: a gate is to judge the measurement as it is.  numbers: that are answered of each."""

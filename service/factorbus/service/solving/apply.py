@@ -58,7 +58,7 @@ _Staged: TypeAlias = tuple[Arrived, int]  # an insert that the solver has taken,
 _Added: TypeAlias = tuple[Verdict, Sequence[Stepped]]  # what came of inserts, and the steps that were made
 
 
-class _TakenBack(Exception):
+class _Undone(Exception):
     """A step with several inserts failed: the solver is as it was before them, by way of these steps."""
 
     def __init__(self, steps: Sequence[Stepped] = ()) -> None:
@@ -119,7 +119,7 @@ class MapSolver(Holding):
         verdict, steps = self._add_together(inserts)
         # By the clock, which a step without waiting comes to: to ask for the thread's time costs a call of the kernel.
         self._cpu_s += time.perf_counter() - started
-        applied = Applied(*self._held, self._cpu_s, time.monotonic())
+        applied = Applied(*self._accepted_counts, self._cpu_s, time.monotonic())
         if not verdict.together or len(steps) != 1 or steps[0].rebuilt:
             return iter((verdict, *steps, applied))
         return SingleInsertResult(verdict.outcomes[0], steps[0], applied)
@@ -156,11 +156,11 @@ class MapSolver(Holding):
         except Exception:
             self._solver = kept or self._solver
             raise
-        account = report.as_dict()
-        account["because"] = f"{GOES_ON}: {report.because}"
-        account["solver_ms"] = (time.perf_counter() - started) * 1e3
-        self._next(account)
-        return [self._told(account)._replace(changed=report.changed, damping=report.damping)], False
+        reported = report.as_dict()
+        reported["because"] = f"{GOES_ON}: {report.because}"
+        reported["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._next(reported)
+        return [self._published(reported)._replace(changed=report.changed, damping=report.damping)], False
 
     def apply(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped | Applied]:
         """Apply `inserts`; every one of them is accepted or refused whole.
@@ -185,8 +185,8 @@ class MapSolver(Holding):
         """Inserts that only add: in one step, or one at a time where that fails."""
         try:
             verdict, steps = self._add_together(inserts)
-        except _TakenBack as taken_back:
-            yield from taken_back.steps
+        except _Undone as undone_steps:
+            yield from undone_steps.steps
             for insert in inserts:
                 yield from self._add([insert])
             return
@@ -197,44 +197,44 @@ class MapSolver(Holding):
             yield from self._convert_to_points(below)
 
     def _add_together(self, inserts: Sequence[Arrived]) -> _Added:
-        """All of `inserts` in one step.  Raises _TakenBack if it failed with several staged."""
+        """All of `inserts` in one step.  Raises _Undone if it failed with several staged."""
         started = time.perf_counter()
         staged: list[_Staged] = []
         refused: list[Outcome] = []
         kept: Any = None  # the solver as it was, where inserts are tried on a copy
-        held, settle = self._held, False
+        counts, settle = self._accepted_counts, False
         try:
             for insert in inserts:
                 try:
-                    first_factor, held = self._stage(insert, held)
+                    first_factor, counts = self._stage(insert, counts)
                     staged.append((insert, first_factor))
                     settle = settle or cast(Insert, insert.content).settle
                 except (Problem, SolverError) as problem:
                     refused.append(refusal(insert, problem))
             if not staged:
                 return Verdict(tuple(refused)), ()
-            if self._wary or not is_usual(self._solver, *self._held):
-                kept, self._solver, held = self._solver, copied(self._solver), self._held
+            if self._wary or not is_usual(self._solver, *self._accepted_counts):
+                kept, self._solver, counts = self._solver, copied(self._solver), self._accepted_counts
                 for insert, _ in staged:
-                    _, held = self._stage(insert, held)
+                    _, counts = self._stage(insert, counts)
             report = self._solver.step(settle)
         except SolverError as problem:
             self._solver = kept or self._solver
             if len(staged) > 1:
-                raise _TakenBack from problem
+                raise _Undone from problem
             return Verdict((*refused, refusal(staged[0][0], problem))), ()
         except Exception:
             self._solver = kept or self._solver
             reference = self._fault()
             steps = list(self._replace_solver(reference))
             if len(inserts) > 1:
-                raise _TakenBack(steps) from None
+                raise _Undone(steps) from None
             return Verdict((Outcome(inserts[0], Internal(reference)),)), steps
         try:
             changed, graph = self._solver.pick_changed()
             diverged = find_diverged(changed, graph, report)
         except Exception:
-            return self._told_nothing(staged, refused, self._account_of(report, started))
+            return self._answered_only(staged, refused, self._report_of(report, started))
         if diverged is not None:
             steps = []
             if kept is not None:
@@ -242,58 +242,59 @@ class MapSolver(Holding):
             else:
                 steps = list(self._go_back(report))
             if len(staged) > 1:
-                raise _TakenBack(steps)
+                raise _Undone(steps)
             return Verdict((*refused, refusal(staged[0][0], diverged))), steps
         self._wary = self._wary or kept is not None
-        return self._told_of(staged, refused, self._account_of(report, started), (changed, graph))
+        return self._answered_and_published(staged, refused, self._report_of(report, started), (changed, graph))
 
-    def _stage(self, insert: Arrived, held: tuple[int, int]) -> tuple[int, tuple[int, int]]:
-        """Hand one insert to the solver, which holds `held` variables and factors; gives the id of its first factor,
+    def _stage(self, insert: Arrived, counts: tuple[int, int]) -> tuple[int, tuple[int, int]]:
+        """Hand one insert to the solver, which holds `counts` variables and factors; gives the id of its first factor,
         and how many it holds then.  Raises Problem, SolverError: then nothing changed."""
         content = insert.content
         if self._broken:
             raise Broken(self._broken)
         if isinstance(content, ParsedInsert):
-            held = self._check_room(held, content.variables, content.factors)
-            return self._solver.stage(Columns(content.message, content.groups)), held
+            counts = self._check_room(counts, content.variables, content.factors)
+            return self._solver.stage(Columns(content.message, content.groups)), counts
         if isinstance(content, Problem):
             raise content
-        held = self._check_room(held, content.batch.variable_count, content.batch.factor_count)
-        return self._solver.stage(content.batch), held
+        counts = self._check_room(counts, content.batch.variable_count, content.batch.factor_count)
+        return self._solver.stage(content.batch), counts
 
-    def _check_room(self, held: tuple[int, int], variables: int, factors: int) -> tuple[int, int]:
+    def _check_room(self, counts: tuple[int, int], variables: int, factors: int) -> tuple[int, int]:
         """How many variables and factors the map has with these.  Raises TooLarge beyond its limits."""
-        limits, with_them = self._limits, (held[0] + variables, held[1] + factors)
+        limits, with_them = self._limits, (counts[0] + variables, counts[1] + factors)
         if with_them[0] > limits.variables:
             raise TooLarge("the map with this insert", with_them[0], limits.variables, "variables", _FULL)
         if with_them[1] > limits.factors:
             raise TooLarge("the map with this insert", with_them[1], limits.factors, "factors", _FULL)
         return with_them
 
-    def _account_of(self, report: Any, started: float, counted: Mapping[str, int] = _NOTHING) -> dict[str, Any]:
+    def _report_of(self, report: Any, started: float, counted: Mapping[str, int] = _NOTHING) -> dict[str, Any]:
         """What the answers and the delta of a step say of it; the map is at its revision then."""
-        account = report.as_dict()
-        account.update(counted)
-        account["solver_ms"] = (time.perf_counter() - started) * 1e3
-        self._next(account)
-        self._held = self._held[0] + report.new_variables, self._held[1] + report.new_factors
-        return account
+        reported = report.as_dict()
+        reported.update(counted)
+        reported["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._next(reported)
+        variables, factors = self._accepted_counts
+        self._accepted_counts = variables + report.new_variables, factors + report.new_factors
+        return reported
 
-    def _told_of(
-        self, staged: Sequence[_Staged], refused: Sequence[Outcome], account: dict[str, Any],
+    def _answered_and_published(
+        self, staged: Sequence[_Staged], refused: Sequence[Outcome], reported: dict[str, Any],
         changed: tuple[I64, FactorGraph], previous: int | None = None,
     ) -> _Added:  # fmt: skip
         """The step went well: the answers and the delta; previous: 0 where that has everything."""
         step = self._step(self._revision - 1 if previous is None else previous)
         try:
-            *answers, delta = self._messages.write(_numbers(staged), step, account, *changed)
+            *answers, delta = self._messages.write(_numbers(staged), step, reported, *changed)
         except Exception:
-            return self._told_nothing(staged, refused, account)
+            return self._answered_only(staged, refused, reported)
         return self._accepted(staged, refused, answers), (self._stepped_to(delta),)
 
-    def _told_nothing(self, staged: Sequence[_Staged], refused: Sequence[Outcome], account: dict[str, Any]) -> _Added:
+    def _answered_only(self, staged: Sequence[_Staged], refused: Sequence[Outcome], reported: dict[str, Any]) -> _Added:
         """The step is done and is answered, but its delta cannot be made: who misses it sees the gap."""
-        answers = self._messages.write_answers(_numbers(staged), self._epoch, self._revision, account)
+        answers = self._messages.write_answers(_numbers(staged), self._epoch, self._revision, reported)
         accepted = self._accepted(staged, refused, answers)
         return accepted, list(self._replace_solver(self._fault()))
 
@@ -307,7 +308,7 @@ class MapSolver(Holding):
         try:
             if self._broken:
                 raise Broken(self._broken)
-            self._check_room(self._held, content.batch.variable_count, content.batch.factor_count)
+            self._check_room(self._accepted_counts, content.batch.variable_count, content.batch.factor_count)
             # Numbers of unusual sizes are tried on another solver, as they are by inserts.
             came = None if self._wary else try_change(self._solver, content.changes, content.batch, content.settle)
         except (Problem, SolverError) as problem:
@@ -349,14 +350,14 @@ class MapSolver(Holding):
         previous: int | None,
     ) -> Iterator[Verdict | Stepped]:  # fmt: skip
         """The step went well; previous: 0 where its delta is to have everything."""
-        staged, account = [(insert, first_factor)], self._account_of(report, started, counted)
-        self._held = self._solver.variable_count, self._solver.factor_count
+        staged, reported = [(insert, first_factor)], self._report_of(report, started, counted)
+        self._accepted_counts = self._solver.variable_count, self._solver.factor_count
         try:
             changed = self._solver.pick_changed()
         except Exception:
-            verdict, steps = self._told_nothing(staged, [], account)
+            verdict, steps = self._answered_only(staged, [], reported)
         else:
-            verdict, steps = self._told_of(staged, [], account, changed, previous)
+            verdict, steps = self._answered_and_published(staged, [], reported, changed, previous)
         yield verdict
         yield from steps
         if below := cast(Insert, insert.content).convert_below:
@@ -381,10 +382,10 @@ class MapSolver(Holding):
             log.exception("%d features stay features: the solver failed with them as points", keys.size)
             return
         self._solver = solver
-        account = report.as_dict() | {"points": int(keys.size)}
-        account["solver_ms"] = (time.perf_counter() - started) * 1e3
-        self._next(account)
-        yield self._told(account, previous=0)
+        reported = report.as_dict() | {"points": int(keys.size)}
+        reported["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._next(reported)
+        yield self._published(reported, previous=0)
 
 
 def _numbers(staged: Sequence[_Staged]) -> list[tuple[int, int]]:

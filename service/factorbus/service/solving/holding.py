@@ -52,9 +52,9 @@ class Holding:
         self._make, self._epoch, self._limits = make_solver, epoch, limits
         self._solver: Any = make_solver()
         self._revision = 0
-        self._account: dict[str, Any] = {}  # of the last step
+        self._last_report: dict[str, Any] = {}  # of the last step
         self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
-        self._held = (0, 0)  # variables and factors that were accepted
+        self._accepted_counts = (0, 0)  # variables and factors that were accepted
         self._converged, self._unfinished = True, False
         self._broken = ""
         self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
@@ -70,7 +70,7 @@ class Holding:
         if self._broken:
             raise Broken(self._broken)
         taken = snapshot(
-            self._solver, self._epoch, self._revision, questions, self._account, self._uncertain, self._room
+            self._solver, self._epoch, self._revision, questions, self._last_report, self._uncertain, self._room
         )
         self._uncertain = taken.uncertain
         rooms = [question.ask.room for question in questions if question.name == "copy"]
@@ -112,7 +112,7 @@ class Holding:
         """All that later records depend on, a copy.  Raises Broken."""
         if self._broken:
             raise Broken(self._broken)
-        state = {"revision": self._revision, "held": list(self._held), "converged": self._converged}
+        state = {"revision": self._revision, "held": list(self._accepted_counts), "converged": self._converged}
         return {"solver": self._solver.dump()} | state
 
     def _copied(self, room: int) -> Copied:
@@ -126,7 +126,7 @@ class Holding:
         Raises ValueError, KeyError, SolverError.
         """
         self._solver, self._revision, self._broken, self._wary = self._make(), 0, "", False
-        self._held, self._converged, self._unfinished = (0, 0), True, False
+        self._accepted_counts, self._converged, self._unfinished = (0, 0), True, False
         if state is None:
             return True
         anew = self._solver.load(state["solver"])
@@ -134,7 +134,7 @@ class Holding:
             check_step(self._solver, anew)
         self._wary = not is_usual(self._solver)
         self._revision = int(state["revision"])
-        self._held = tuple(state["held"])
+        self._accepted_counts = tuple(state["held"])
         self._converged = bool(state["converged"] if anew is None else anew.converged)
         self._unfinished = bool(self._solver.unfinished)
         return anew is None
@@ -152,13 +152,13 @@ class Holding:
         """What its solver has in use."""
         return int(self._solver.memory_bytes())
 
-    def _told(self, account: dict[str, Any], previous: int | None = None) -> Stepped:
+    def _published(self, reported: dict[str, Any], previous: int | None = None) -> Stepped:
         """The solver's last step, with its delta; what it takes to find out what changed is the solver's time, too."""
         previous = self._revision - 1 if previous is None else previous
         started = time.perf_counter()
         changed, graph = self._solver.pick_changed()
-        account["solver_ms"] += (time.perf_counter() - started) * 1e3
-        return self._stepped_to(self._messages.write_delta(self._step(previous), account, changed, graph))
+        reported["solver_ms"] += (time.perf_counter() - started) * 1e3
+        return self._stepped_to(self._messages.write_delta(self._step(previous), reported, changed, graph))
 
     def _step(self, previous: int) -> tuple[int, int, int]:
         """Epoch and revision of the last step, and the one before."""
@@ -166,16 +166,16 @@ class Holding:
 
     def _stepped_to(self, delta: bytes) -> Stepped:
         """The last step, which `delta` tells of."""
-        account = self._account
-        told = account["strategy"], account["chi2"], account["solver_ms"]
+        reported = self._last_report
+        told = reported["strategy"], reported["chi2"], reported["solver_ms"]
         return Stepped(self._revision, delta, *told, converged=self._converged, unfinished=self._unfinished)
 
-    def _next(self, account: dict[str, Any]) -> None:
-        """The solver has made a step: its `account` says, too, whether more are to follow."""
+    def _next(self, reported: dict[str, Any]) -> None:
+        """The solver has made a step: `reported` says, too, whether more are to follow."""
         self._revision += 1
-        self._account, self._uncertain = account, None
-        self._converged, self._unfinished = _has_converged(account), bool(self._solver.unfinished)
-        account["converging"] = self._unfinished or not self._converged
+        self._last_report, self._uncertain = reported, None
+        self._converged, self._unfinished = _has_converged(reported), bool(self._solver.unfinished)
+        reported["converging"] = self._unfinished or not self._converged
 
     def _fault(self) -> str:
         """Log what is being handled; the reference under which it is found."""
@@ -186,10 +186,10 @@ class Holding:
     def _replace_solver(self, reference: str) -> Iterator[Stepped]:
         """A new solver with what had been accepted, and the step that brought it there."""
         try:
-            account = self._rebuild()
-            if account is not None:
-                self._next(account)
-                yield self._told(account)._replace(rebuilt=True)
+            reported = self._rebuild()
+            if reported is not None:
+                self._next(reported)
+                yield self._published(reported)._replace(rebuilt=True)
         except Exception:
             self._broken = reference
             log.exception("fault %s: what had been accepted could not be brought back; the map is broken", reference)
@@ -201,37 +201,38 @@ class Holding:
         """
         started = time.perf_counter()
         try:
-            solver, own = undone(self._solver, report, *self._held)
+            solver, own = undone(self._solver, report, *self._accepted_counts)
         except Exception:
             self._broken = secrets.token_hex(4)
             log.exception("fault %s: a step could not be undone; the map is broken", self._broken)
             return
         self._solver = solver
-        if not any(self._held):
+        if not any(self._accepted_counts):
             return
-        account = own.as_dict() | {
+        reported = own.as_dict() | {
             "strategy": "full", "because": "a step that diverged was undone", "new_variables": 0, "new_factors": 0,
             "solver_ms": (time.perf_counter() - started) * 1e3,
         }  # fmt: skip
-        self._next(account)
-        yield self._told(account)
+        self._next(reported)
+        yield self._published(reported)
 
     def _rebuild(self) -> dict[str, Any] | None:
         """What had been accepted are the first variables and factors: whatever a failed insert left is behind them."""
-        variables, _ = self._solver.graph(*self._held)
+        variables, _ = self._solver.graph(*self._accepted_counts)
         for group in variables:
             if not np.isfinite(group.values).all():
                 raise ValueError(f"the failed solver's values of {group.kind} are not finite")
         fresh, started = self._make(), time.perf_counter()
-        report = fresh.renew(self._solver, *self._held)
+        report = fresh.renew(self._solver, *self._accepted_counts)
         found = fresh.variable_count, fresh.factor_count
-        if found != self._held:
-            raise ValueError(f"the failed solver holds {found} variables and factors; accepted were {self._held}")
+        if found != self._accepted_counts:
+            accepted = self._accepted_counts
+            raise ValueError(f"the failed solver holds {found} variables and factors; accepted were {accepted}")
         self._solver = fresh
-        if not any(self._held):
+        if not any(self._accepted_counts):
             return None
         return report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
 
 
-def _has_converged(account: Mapping[str, Any]) -> bool:
-    return bool(account.get("converged", True))
+def _has_converged(reported: Mapping[str, Any]) -> bool:
+    return bool(reported.get("converged", True))

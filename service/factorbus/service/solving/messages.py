@@ -11,7 +11,7 @@ from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import I64
 
 # Of a usual step; those of a larger one are written to an array of their own.
-_ROOM = 48 << 10
+ROOM = 48 << 10
 _NOTHING = np.empty(0, np.int64)
 
 
@@ -23,7 +23,7 @@ class StepMessages:
     """
 
     def __init__(self) -> None:
-        self._out = np.empty(_ROOM, np.uint8)
+        self._out = np.empty(ROOM, np.uint8)
         self._pack = codec.report_encoder()
         self._step, self._answer, self._ends = np.empty(3, np.int64), np.empty((1, 2), np.int64), np.empty(2, np.int64)
         self._step_view, self._answer_view, self._written = self._step.data, self._answer[0].data, self._out.data
@@ -32,7 +32,7 @@ class StepMessages:
         self,
         answers: Sequence[tuple[int, int]],
         step: tuple[int, int, int],
-        account: Mapping[str, Any],
+        reported: Mapping[str, Any],
         changed: I64,
         graph: FactorGraph,
     ) -> list[bytes]:
@@ -48,7 +48,7 @@ class StepMessages:
             view[0], view[1] = answers[0]
         else:
             numbers, ends = np.array(answers, np.int64).reshape(-1, 2), np.empty(len(answers) + 1, np.int64)
-        report, out, written = self._pack(account), self._out, self._written
+        report, out, written = self._pack(reported), self._out, self._written
         size = write_messages(numbers, self._step, report, changed, graph.array_table, out, ends)
         if size > len(out):
             out = np.empty(size, np.uint8)
@@ -61,13 +61,13 @@ class StepMessages:
         return messages
 
     def write_answers(
-        self, answers: Sequence[tuple[int, int]], epoch: int, revision: int, account: Mapping[str, Any]
+        self, answers: Sequence[tuple[int, int]], epoch: int, revision: int, reported: Mapping[str, Any]
     ) -> list[bytes]:
         """The answers alone."""
-        return self.write(answers, (epoch, revision, NO_DELTA), account, _NOTHING, FactorGraph())[:-1]
+        return self.write(answers, (epoch, revision, NO_DELTA), reported, _NOTHING, FactorGraph())[:-1]
 
     def write_delta(
-        self, step: tuple[int, int, int], account: Mapping[str, Any], changed: I64, graph: FactorGraph
+        self, step: tuple[int, int, int], reported: Mapping[str, Any], changed: I64, graph: FactorGraph
     ) -> bytes:
         """The delta alone."""
-        return self.write((), step, account, changed, graph)[0]
+        return self.write((), step, reported, changed, graph)[0]

@@ -95,9 +95,9 @@ class TreeSteps:
         self._at_linearization = False
         if not settle and not tree.state.item(tl.S_AFTER) and not self._stalls:
             self._damping = 0.0
-            return self._account(started, compiled, None, because)
+            return self._report(started, compiled, None, because)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
-        return self._account(started, compiled, result, because)
+        return self._report(started, compiled, result, because)
 
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
@@ -275,7 +275,7 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(self, started: float, compiled: float, result: Minimization | None, because: str) -> StepReport:
+    def _report(self, started: float, compiled: float, result: Minimization | None, because: str) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], result is not None

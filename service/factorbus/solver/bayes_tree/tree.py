@@ -80,7 +80,7 @@ class CliqueTree(Arenas):
         if sure:
             self.state[tl.S_CHECKED] = 1
         while (status := tree_step(self._graph.array_table, self.array_table, TASK_QUEUE, NOBODY)) == tl.NO_ROOM:
-            self._make_room()
+            self.make_room()
         return status
 
     @property
@@ -139,7 +139,7 @@ class CliqueTree(Arenas):
         """Of the arenas that are by far the largest, how many entries a copy needs."""
         return {"numbers": int(self.state[tl.S_NUMBERS]), "hessian": int(self.state[tl.S_HESSIAN])}
 
-    def _make_room(self) -> None:
+    def make_room(self) -> None:
         self._make_room_for_graph()
         state = self.state
         if (need := int(state[tl.S_NEED_CLIQUES])) > len(self.clique):

@@ -1,7 +1,7 @@
 """Features of inverse depth become points.  MATH §3.3.
 
-A point has half the numbers of a feature, and its sights half the work; it is as good a Gaussian once its depth is
-known.  What changes is the form, not the estimate: the point is where the feature stood for, and the same pixels are
+A point has half the numbers of a feature, and its observations half the work; it is as good a Gaussian once its depth
+is known.  What changes is the form, not the estimate: the point is where the feature stood for, and the same pixels are
 measured of it.  What goes is the tie to the anchor and the first guess of the depth, which has done its work by then.
 """
 
@@ -20,7 +20,7 @@ from factorbus.solver.kernels.model.kinds import LINEAR
 from factorbus.solver.lenses.layout import LENS_SIZE
 
 _TURNING = "turning features into points"
-# Of a first sight's payload: where the lens is, and the pixel's block in the upper triangle of a 6 × 6 matrix.
+# Of a first observation's payload: where the lens is, and the pixel's block in the upper triangle of a 6 × 6 matrix.
 _LENS = np.arange(3, 4 + LENS_SIZE)
 _PIXEL_BLOCK = np.array([15, 16, 18])
 # Where the information of its guess of ρ is, and how much surer than the guess (σ) one has to be to do without.

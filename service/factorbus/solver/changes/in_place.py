@@ -35,8 +35,8 @@ def try_in_place(
     try:
         if edit.make():
             report = steps.step(settle=False)
-            if _is_sound(graph, steps, report):
-                return first, report._replace(because=f"{_told(edit)}; {report.because}")
+            if is_sound(graph, steps, report):
+                return first, report._replace(because=f"{_described(edit)}; {report.because}")
             steps.restore(report)
     except SolverError:
         pass  # whether it can be made at all, and why not, is for a solver of what is left to say
@@ -56,12 +56,12 @@ def _take_back(steps: TreeSteps, edit: FactorEdit, count: tuple[int, int]) -> No
     steps.rebase(-count[0], -count[1])
 
 
-def _is_sound(graph: FactorGraph, steps: TreeSteps, report: StepReport) -> bool:
+def is_sound(graph: FactorGraph, steps: TreeSteps, report: StepReport) -> bool:
     """Whether everything that the step moved, and χ², is within bounds."""
     escaped = find_escaped(steps.changed(), graph.array_table) >= 0
     return not escaped and bool(np.isfinite(report.chi2) and np.isfinite(report.chi2_before))
 
 
-def _told(edit: FactorEdit) -> str:
+def _described(edit: FactorEdit) -> str:
     parts = [(edit.counts[0], "removed"), (edit.counts[1], "with another weight or loss")]
     return ", ".join(f"{counted(count, 'factor')} {what}" for count, what in parts if count)

@@ -1,8 +1,8 @@
 """Variables taken out of a graph for good: what their factors say of the others is kept as linear factors.  MATH §11.3.
 
-Variables that hang together go together.  Those that they share a factor with are their border, and what they say of
+Variables that hang together go together.  Those that they share a factor with are their separator, and what they say of
 it is a linear factor there, linearized at the estimate: of one variable or two, or a prior of one point that it
-determines.  Of more variables it is one in pieces (`joints`).  Refused is a border of more than MOST variables.
+determines.  Of more variables it is one in pieces (`joints`).  Refused is a separator of more than MOST variables.
 """
 
 import numpy as np
@@ -17,8 +17,8 @@ from factorbus.solver.graph.quadratic import Quadratic, kind_of, quadratic
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
-# Below this share of the largest eigenvalue a direction of the border is not known at all, nor is a scalar of which no
-# more than this share is left of what was known of it.
+# Below this share of the largest eigenvalue a direction of the separator is not known at all; nor is a scalar of which
+# no more than this share is left of what was known of it.
 _NOTHING = 1e-13
 
 
@@ -31,11 +31,11 @@ def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[Fac
     used: list[int] = []
     for part, rows in _pieces(graph, gone, kept):
         used += rows
-        _check_border(graph, part or gone[:1].tolist(), rows, gone)
+        _check_separator(graph, part or gone[:1].tolist(), rows, gone)
         whole = quadratic(graph, rows, part)
-        border = whole.variables[len(part) :]
-        if border:
-            made += _as_factors(graph, border, *_reduced(graph, whole, len(part)))
+        separator = whole.variables[len(part) :]
+        if separator:
+            made += _as_factors(graph, separator, *_reduced(graph, whole, len(part)))
     return made, used
 
 
@@ -77,16 +77,16 @@ def _pieces(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[list[
     return [(variables.get(head, []), sorted(factors.get(head, []))) for head in heads]
 
 
-def _check_border(graph: FactorGraph, part: list[int], rows: list[int], gone: I64) -> None:
+def _check_separator(graph: FactorGraph, part: list[int], rows: list[int], gone: I64) -> None:
     """Before anything is computed of it.  Raises TooConnected."""
     ends = np.setdiff1d([v for row in rows for v in graph.ends_of(row)], gone).astype(np.int64)
-    border = ends[graph.var[ends, at.V_COLUMN] >= 0]
-    if border.size > MOST:
-        raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[border].tolist(), MOST)
+    separator = ends[graph.var[ends, at.V_COLUMN] >= 0]
+    if separator.size > MOST:
+        raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[separator].tolist(), MOST)
 
 
 def _reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64]:
-    """Λ and η of the border once the first `count` variables have taken theirs.  (11.4)"""
+    """Λ and η of the separator once the first `count` variables have taken theirs.  (11.4)"""
     if not count:
         return whole.information, whole.eta
     cut = whole.starts[whole.variables[count]]
@@ -106,12 +106,16 @@ def _reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64
     return information, eta
 
 
-def _as_factors(graph: FactorGraph, border: list[int], information: F64, eta: F64) -> list[FactorGroup]:
-    """Linear factors on the border with these Λ and η."""
-    kinds, keys, y = [kind_of(graph, v).name for v in border], graph.keys[border], [_value(graph, v) for v in border]
-    if len(border) > 2:
+def _as_factors(graph: FactorGraph, separator: list[int], information: F64, eta: F64) -> list[FactorGroup]:
+    """Linear factors on the separator with these Λ and η."""
+    kinds, keys, y = (
+        [kind_of(graph, v).name for v in separator],
+        graph.keys[separator],
+        [_value(graph, v) for v in separator],
+    )
+    if len(separator) > 2:
         pieces = cut(kinds, keys, y, information, eta)
-    elif len(border) == 1 and kinds[0] in ("point2", "point3") and _is_determined(information):
+    elif len(separator) == 1 and kinds[0] in ("point2", "point3") and _is_determined(information):
         return [_prior(kinds[0], keys, y[0], information, eta)]
     else:
         R, d = _root(information, eta)

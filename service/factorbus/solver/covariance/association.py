@@ -1,4 +1,4 @@
-"""Which landmark each of a robot's sightings is of: compatible one by one, and all together.  MATH §10.4."""
+"""Which landmark each of a robot's observations is of: compatible one by one, and all together.  MATH §10.4."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,16 +24,16 @@ _MOST_PAIRS = 2000  # compatible ones: their joint covariance has that many rows
 class Association:
     """What was found.
 
-    landmark (n,): the variable that each sighting is of in the best joint hypothesis, −1: none of those there are
+    landmark (n,): the variable that each observation is of in the best joint hypothesis, −1: none of those there are
     distance: its joint d², dims: of how many numbers   complete: the search was not cut short
-    sightings, landmarks, distances (pairs,): all that are compatible one by one, by sighting, the nearest first
+    observations, landmarks, distances (pairs,): all that are compatible one by one, by observation, the nearest first
     """
 
     landmark: I64
     distance: float
     dims: int
     complete: bool
-    sightings: I64
+    observations: I64
     landmarks: I64
     distances: F64
 
@@ -42,7 +42,7 @@ def associate(
     blocks: CovarianceBlocks, kind: str, pose: int, measured: F64, information: F64, landmarks: I64, probability: float,
     weigh: Callable[[I64, int], None] = lambda *_: None,
 ) -> Association:  # fmt: skip
-    """Sightings (rows of `measured` and `information`, as of a factor of `kind`) from variable `pose`.
+    """Observations (rows of `measured` and `information`, as of a factor of `kind`) from variable `pose`.
 
     landmarks: variables to choose from.  weigh: called before the joint covariance is computed, with its
     variables and how many numbers are measured; it may raise.
@@ -56,26 +56,30 @@ def associate(
     found = evaluate_candidates(blocks, [every] if n * L else [])
     distance = found.distance.reshape(n, L)
     near = distance <= threshold(np.array([dim]), probability)[0]
-    sightings, columns = np.nonzero(near)
-    order = np.lexsort((distance[sightings, columns], sightings))
-    sightings, columns = sightings[order], columns[order]
-    if sightings.size > _MOST_PAIRS:
-        raise TooLarge("the question", int(sightings.size), _MOST_PAIRS, "compatible pairs of sighting and landmark")
-    weigh(np.unique(np.append(landmarks[columns], pose)), dim * sightings.size)
-    chosen = sightings * L + columns
+    observations, columns = np.nonzero(near)
+    order = np.lexsort((distance[observations, columns], observations))
+    observations, columns = observations[order], columns[order]
+    if observations.size > _MOST_PAIRS:
+        raise TooLarge(
+            "the question", int(observations.size), _MOST_PAIRS, "compatible pairs of observation and landmark"
+        )
+    weigh(np.unique(np.append(landmarks[columns], pose)), dim * observations.size)
+    chosen = observations * L + columns
     pairs = FactorGroup(kind, every.keys[chosen], every.measured[chosen], every.information[chosen])
-    begin = np.searchsorted(sightings, np.arange(n + 1))
+    begin = np.searchsorted(observations, np.arange(n + 1))
     best, joint, complete = _search(blocks, pairs, begin, columns, probability)
     landmark = np.full(n, -1)
     landmark[best >= 0] = landmarks[columns[best[best >= 0]]]
     dims = dim * int((best >= 0).sum())
-    return Association(landmark, joint, dims, complete, sightings, landmarks[columns], distance[sightings, columns])
+    return Association(
+        landmark, joint, dims, complete, observations, landmarks[columns], distance[observations, columns]
+    )
 
 
 def _search(
     blocks: CovarianceBlocks, pairs: FactorGroup, begin: I64, landmark: I64, probability: float
 ) -> tuple[I64, float, bool]:
-    """(pair of each sighting, joint d², whether it is surely the best); arguments as in `search`."""
+    """(pair of each observation, joint d², whether it is surely the best); arguments as in `search`."""
     n, dim = begin.size - 1, FACTOR_KINDS[pairs.kind].dim
     S, r = _joint_innovations(blocks, pairs, dim)
     gates = np.concatenate([[0.0], threshold(dim * np.arange(1, n + 1), probability)])

@@ -24,7 +24,7 @@ _STEPS = (tl.N_LINEARIZED, tl.N_MOVED, tl.N_SEEN)
 
 
 @dataclass(frozen=True, slots=True)
-class FactorAccount:
+class FactorExplanation:
     """One factor at the estimate.
 
     residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: s = rᵀ Ω r; all as without loss
@@ -56,7 +56,7 @@ class FactorAccount:
 
 
 @dataclass(frozen=True, slots=True)
-class VariableAccount:
+class VariableExplanation:
     """One variable.
 
     sigmas (d,): standard deviations in its tangent space; zero where it is fixed   covariance (d, d)
@@ -78,7 +78,7 @@ class VariableAccount:
     linearized_step: int
     changed_step: int
     seen_step: int
-    factors: list[FactorAccount] = field(default_factory=list)
+    factors: list[FactorExplanation] = field(default_factory=list)
     stamp: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class VariableAccount:
         return plain | arrays | {"factors": [each.as_dict() for each in self.factors]}
 
 
-def why_factor(blocks: CovarianceBlocks, factor: int) -> FactorAccount:
+def why_factor(blocks: CovarianceBlocks, factor: int) -> FactorExplanation:
     """Of the factor with this id.  Raises UnknownFactor."""
     graph = blocks.factored.graph
     row = int(graph.rows_of(np.array([factor]))[0])
@@ -99,7 +99,7 @@ def why_factor(blocks: CovarianceBlocks, factor: int) -> FactorAccount:
     return _why_row(blocks, row)
 
 
-def why_variable(blocks: CovarianceBlocks, variable: int, keeps_steps: bool) -> VariableAccount:
+def why_variable(blocks: CovarianceBlocks, variable: int, keeps_steps: bool) -> VariableExplanation:
     """Of the variable with this index.  keeps_steps: the record is that of the map's own tree."""
     f = blocks.factored
     graph, node = f.graph, f.tree.node[variable]
@@ -114,15 +114,15 @@ def why_variable(blocks: CovarianceBlocks, variable: int, keeps_steps: bool) -> 
     value = graph.values[row[at.V_AT] : row[at.V_AT] + kind.size].copy()
     sigmas = np.sqrt(np.diag(covariance))
     stamps = graph.stamps_of(np.array([variable]))
-    return VariableAccount(
+    return VariableExplanation(
         int(graph.keys[variable]), kind.name, fixed, value, sigmas, covariance, pivot, conditioning, linearized_step,
         changed, seen, factors, None if stamps is None else int(stamps[0]),
     )  # fmt: skip
 
 
-def _why_row(blocks: CovarianceBlocks, row: int) -> FactorAccount:
+def _why_row(blocks: CovarianceBlocks, row: int) -> FactorExplanation:
     linear = linearize_factor(blocks.factored.graph, row)
-    return _account(blocks, row, linear, linear.J @ blocks.joint(linear.ends) @ linear.J.T)
+    return _explained(blocks, row, linear, linear.J @ blocks.joint(linear.ends) @ linear.J.T)
 
 
 def _pivot(blocks: CovarianceBlocks, variable: int, factors: list[int]) -> tuple[float, float]:
@@ -141,7 +141,7 @@ def _pivot(blocks: CovarianceBlocks, variable: int, factors: list[int]) -> tuple
     return float(pivots.min()), float((pivots**2 / diagonal).min())
 
 
-def _account(blocks: CovarianceBlocks, index: int, linear: Linearized, T: F64) -> FactorAccount:
+def _explained(blocks: CovarianceBlocks, index: int, linear: Linearized, T: F64) -> FactorExplanation:
     """linear, T: with r and H times √w, as the solver has them."""
     graph = blocks.factored.graph
     row, factor = graph.fac[index], int(graph.ids_of(np.array([index]))[0])
@@ -158,7 +158,7 @@ def _account(blocks: CovarianceBlocks, index: int, linear: Linearized, T: F64) -
     without = None
     if sign > 0.0 and np.linalg.eigvalsh(np.eye(d) - M)[0] > _NOTHING:
         without = rho + float(whitened @ np.linalg.solve(np.eye(d) - M, M @ whitened))
-    return FactorAccount(
+    return FactorExplanation(
         factor, kind.name, keys, r, L.T @ r, s, d, float(np.trace(W @ T)), without,
         LOSS_OF_CODE.get(int(losses_of(row)), ""), 0.0 if inactive else _weight(r, softened), rho,
         inactive,

@@ -40,8 +40,8 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns, whole: bool = True) ->
     that is positive semidefinite (`joints`); else it may not.
 
     Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, OutOfBounds,
-    BadQuaternion, BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialized; `graph` is as it
-    was then.
+    BadQuaternion, BadRange, BadLens, BadObservation, BadLoss, NotPositiveDefinite, Apart, Uninitialized; `graph` is as
+    it was then.
     """
     raw, groups, problem = (batch.raw, batch.groups, None) if isinstance(batch, Columns) else locate_columns(batch)
     mark, first = graph.mark(), graph.next_id

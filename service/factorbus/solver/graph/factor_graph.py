@@ -61,7 +61,7 @@ class FactorGraph(Arenas):
         self._rows = Rows()
 
     @property
-    def sights(self) -> bool:
+    def has_observations(self) -> bool:
         """Whether any camera has seen anything."""
         kinds = self.fac[: self.counts[at.FACTORS], at.F_KIND]
         return bool(CAMERA[kinds].any())

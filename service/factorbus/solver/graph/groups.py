@@ -10,7 +10,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 class VariablesLike(Protocol):
     """Variables of one kind that come in: keys (n,), values (n, size) or None, fixed: not estimated.
 
-    stamps (n,): time stamps, carried and given back; `layout.NO_STAMP` of one without, None of all.
+    stamps (n,): time stamps, carried and returned; `layout.NO_STAMP` of one without, None of all.
     """
 
     @property

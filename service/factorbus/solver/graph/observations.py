@@ -14,7 +14,7 @@ from factorbus.solver.kernels.model.bounds import MOST_NUMBER
 from factorbus.solver.lenses import layout as lens_at
 from factorbus.solver.lenses.limits import limit_of
 
-# Why a sight has no pixel, or a pixel no ray.
+# Why an observation has no pixel, or a pixel no ray.
 REASONS = {
     lens_at.OUTSIDE_LENS: "beyond where the lens model is one to one",
     lens_at.VERTICAL: "its ray runs along the map's y axis, where azimuth has no meaning",
@@ -41,17 +41,17 @@ def with_limits(kind: FactorKind, measured: F64) -> F64:
 
 
 def check(graph: FactorGraph, first_factor: int) -> None:
-    """Are all sights from factor `first_factor` on possible where their ends are?  Raises BadSight."""
+    """Are all observations from factor `first_factor` on possible where their ends are?  Raises BadObservation."""
     last = int(graph.counts[at.FACTORS])
     row, status = find_lost(True, first_factor, last, graph.var, graph.fac, graph.values, graph.payload)
     if row >= 0:
         p = int(graph.fac[row, at.F_AT])
         pixel = float(graph.payload[p]), float(graph.payload[p + 1])
-        raise errors.BadSight(graph.describe(row), pixel, REASONS[int(status)])
+        raise errors.BadObservation(graph.describe(row), pixel, REASONS[int(status)])
 
 
 def inactive(graph: FactorGraph) -> list[tuple[int, str, str]]:
-    """(id, the factor, why) of every sight that has no pixel at the present values."""
+    """(id, the factor, why) of every observation that has no pixel at the present values."""
     found, row, last = [], -1, int(graph.counts[at.FACTORS])
     while True:
         row, status = find_lost(False, row + 1, last, graph.var, graph.fac, graph.values, graph.payload)
@@ -61,7 +61,7 @@ def inactive(graph: FactorGraph) -> list[tuple[int, str, str]]:
 
 
 def why_inactive(graph: FactorGraph, factor: int) -> str:
-    """Why the sight `factor` has no pixel at the present values; empty: it has one, or is no sight."""
+    """Why the observation `factor` has no pixel at the present values; empty: it has one, or is no observation."""
     row, status = find_lost(False, factor, factor + 1, graph.var, graph.fac, graph.values, graph.payload)
     return REASONS[int(status)] if row >= 0 else ""
 

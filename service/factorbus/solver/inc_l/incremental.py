@@ -43,6 +43,16 @@ class Incremental:
         self._rows_have_d = False
 
     @property
+    def where(self) -> Where:
+        """Where the undamped R of the present Λ is."""
+        return self._have
+
+    @property
+    def rows_have_d(self) -> bool:
+        """Whether the block rows have d beside R."""
+        return self._rows_have_d
+
+    @property
     def have_r(self) -> bool:
         """Whether there is an undamped R of the present Λ."""
         return self._have is not Where.NOWHERE

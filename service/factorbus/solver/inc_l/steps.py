@@ -4,7 +4,7 @@
 2  check      every new variable is held by something
 3  follow     R and d are updated, or given up
 4  solve      Gauss-Newton, if there is anything to solve
-5  account    what was done, and where this leaves things
+5  report     what was done, and where this leaves things
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ _LEAST_TRUST, _TRUST_BY_DENSITY, _LEARN, _TRY_AGAIN = 0.15, 0.1, 0.1, 16
 class _Done:
     """Where the last step left things: what a failed step goes back to.
 
-    unsolved: χ² of the factors taken in since the system was last solved; infinite if that had not converged.
+    unsolved: χ² of the factors added since the system was last solved; infinite if that had not converged.
     finished: nothing has moved since another step would have taken no more than a share `FINISHED` off χ².
     batch: variables when the whole system was last solved anew, which the modes with forced batches count from.
     """
@@ -132,7 +132,7 @@ class IncrementalSteps:
         except BaseException:
             self._take_back()
             raise
-        # 5. Remember where this leaves things, and account for it.
+        # 5. Remember where this leaves things, and report it.
         report = self._report(result, added, self._reported(plan, because, batch), watch)
         self._commit(result, added, bool(because), batch, finished)
         return report
@@ -292,7 +292,7 @@ class IncrementalSteps:
             changed=int(self._changed.size),
             relinearized=result.iterations * columns,
             eliminated=plan.rows + result.factorizations * columns,
-            inactive=len(observations.inactive(self._graph)) if self._graph.sights else 0,
+            inactive=len(observations.inactive(self._graph)) if self._graph.has_observations else 0,
             nnz_r=nonzeros,
             flops=flops,
             damping=result.damping,

@@ -1,4 +1,4 @@
-"""Joint compatibility branch and bound: which sighting is of which landmark, all of them together.  MATH §10.4.
+"""Joint compatibility branch and bound: which observation is of which landmark, all of them together.  MATH §10.4.
 
 After Neira and Tardós, "Data association in stochastic mapping using the joint compatibility test" (2001).
 """
@@ -14,11 +14,11 @@ from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel,
 def search(begin: I64, landmark: I64, S: F64, r: F64, gates: F64, budget: int, best: I64) -> int:
     """The largest set of pairs that is jointly compatible; among equals that with the least joint d².
 
-    in   begin (n + 1,): the pairs of sighting i are begin[i] .. begin[i + 1]−1, best first
+    in   begin (n + 1,): the pairs of observation i are begin[i] .. begin[i + 1]−1, best first
          landmark (pairs,): 0 or more   gates (n + 1,): d² allowed for 0 .. n pairs
          S (pairs·dim, pairs·dim): joint covariance of all innovations   r (pairs, dim)
          budget: pairs that are tried at most
-    out  best (n,): the pair of each sighting, −1: none
+    out  best (n,): the pair of each observation, −1: none
          returns how many pairs were tried; unless that is above the budget, no set is better
     """
     n, dim, landmarks = begin.size - 1, r.shape[1], 0

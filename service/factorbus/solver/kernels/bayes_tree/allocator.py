@@ -1,4 +1,4 @@
-"""Memory of the tree: blocks of two arenas, kept for reuse by size class when they are given back.
+"""Memory of the tree: blocks of two arenas, kept for reuse by size class when they are freed.
 
 Sizes are rounded up to one of eight classes per doubling, so a block wastes an eighth at most, and a free block serves
 any request of its class.  A free block holds the place of the next one of its class plus one in its first entry.
@@ -100,13 +100,13 @@ def find_free(kind: int, state: I64) -> int:
 
 @inline_kernel
 def is_worth_joining(state: I64) -> bool:
-    """Whether enough is free, and was given back since the last time, to look through all of it."""
+    """Whether enough is free, and was freed since the last time, to look through all of it."""
     return 4 * state[tl.S_IDLE] > state[tl.S_NUMBERS] and 8 * state[tl.S_GIVEN] > state[tl.S_NUMBERS]
 
 
 @part
 def join_free(numbers: F64, state: I64) -> None:
-    """Free blocks that are neighbours become one; the last one is given back to what was never in use."""
+    """Free blocks that are neighbours become one; the last one is returned to what was never in use."""
     count = 0
     for kind in range(tl.CLASSES):
         block = state[tl.S_FREE + kind]

@@ -54,7 +54,7 @@ def begin_step(graph: Graph, tree: Tree) -> int:
 def are_determined_in_order(
     v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, determined: I64
 ) -> bool:
-    """Whether the factors f0 .. f1−1, in their order, determine all: as they do where a robot drives on."""
+    """Whether the factors f0 .. f1−1, in their order, determine all: as they do in an odometry step."""
     left = 0
     for k in range(determined.size):
         left += 1 - determined[k]

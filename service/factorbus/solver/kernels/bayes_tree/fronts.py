@@ -60,7 +60,7 @@ def join_fronts(n: int, perm: I64, parent: I64, dim: I64, scalars: I64, affected
 
 @inline_kernel
 def is_root_alone(marked: I64, n: int, new: int, affected: I64, settings: F64, var: I64, clique: I64) -> bool:
-    """Whether a step only puts a variable or two to a root that stays small: a robot that drives on."""
+    """Whether a step only puts a variable or two to a root that stays small: an odometry step."""
     if marked.size != 1 or new > 2 or clique[marked[0], tl.C_PARENT] >= 0:
         return False
     pivots = 0

@@ -49,7 +49,11 @@ def close_gaps(gone: I64, graph_table: I64, tree_table: I64) -> None:
 
 @kernel("void(int64[::1], int64[::1], int64[::1])")
 def open_gaps(gone: I64, graph_table: I64, tree_table: I64) -> None:
-    """Undo `close_gaps`: the rows `gone` are there again, to be filled and linked by the caller."""
+    """Undo `close_gaps`: the rows `gone` are there again, to be filled and linked by the caller.
+
+    Two functions, as one moves rows up from the first on, the other down from the last on: neither overwrites what it
+    has yet to move.
+    """
     graph, tree = graph_at(graph_table), tree_at(tree_table)
     fac, counts = graph.fac, graph.counts
     link, factor_errors, state = tree.link, tree.factor_errors, tree.state

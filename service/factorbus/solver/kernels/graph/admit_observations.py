@@ -1,4 +1,4 @@
-"""Can a camera have seen what is said that it saw?  Asked when a sight comes in.  MATH §3.1."""
+"""Can a camera have seen what is said that it saw?  Asked when an observation comes in.  MATH §3.1."""
 
 import math
 
@@ -19,9 +19,9 @@ _VERTICAL = 1e-6
 
 @kernel("UniTuple(int64, 2)(boolean, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1])")
 def find_lost(new: bool, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64) -> tuple:
-    """(the first sight of factors f0 .. f1−1 that has no pixel at `values`, and why); or (−1, GOOD).
+    """(the first observation of factors f0 .. f1−1 that has no pixel at `values`, and why); or (−1, GOOD).
 
-    new: it has to be possible as well: a ray through the pixel, and of a first sight one that has an azimuth
+    new: it has to be possible as well: a ray through the pixel, and of a first observation one that has an azimuth
     """
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):

@@ -34,7 +34,7 @@ def check_value(kind: int, x: int, size: int, values: F64) -> int:
         values[x + 2] = wrap(values[x + 2])
     if kind == at.IDP:
         values[x + 3] = wrap(values[x + 3])
-    if kind == at.SE3 and not make_unit(values, x + 3):
+    if kind == at.SE3 and not normalize_quaternion(values, x + 3):
         return gt.BAD_QUATERNION
     return gt.GOOD
 
@@ -76,38 +76,41 @@ def check_measurement(kind: int, p: int, payload: F64) -> int:
         return gt.BAD_RANGE
     for e in range(2):
         n = direction_at(kind, e)
-        if n >= 0 and not make_direction(payload, p + n):
+        if n >= 0 and not normalize_direction(payload, p + n):
             return gt.BAD_DIRECTION
         n = quaternion_at(kind, e)
-        if n >= 0 and not make_unit(payload, p + n):
+        if n >= 0 and not normalize_quaternion(payload, p + n):
             return gt.BAD_QUATERNION
     return gt.GOOD
 
 
 @inline_kernel
-def make_direction(v: F64, k: int) -> bool:
-    """Bring the vector at k to unit length, unless it is there to the last bit; False: it has none."""
+def normalize_direction(v: F64, k: int) -> bool:
+    """Bring the vector at k, of any length but zero, to unit length; False: it has none."""
     n2 = v[k] * v[k] + v[k + 1] * v[k + 1] + v[k + 2] * v[k + 2]
     if not n2 > 1e-100:
         return False
-    if abs(n2 - 1.0) > 4e-16:
-        scale = 1.0 / math.sqrt(n2)
-        for c in range(3):
-            v[k + c] *= scale
+    normalize(v, k, 3, n2)
     return True
 
 
 @inline_kernel
-def make_unit(q: F64, k: int) -> bool:
-    """Bring the quaternion at k to unit length, unless it is there to the last bit; False: it is none."""
+def normalize_quaternion(q: F64, k: int) -> bool:
+    """Bring the quaternion at k, whose length may be off by rounding only, to unit length; False: it is none."""
     n2 = q[k] * q[k] + q[k + 1] * q[k + 1] + q[k + 2] * q[k + 2] + q[k + 3] * q[k + 3]
     if not abs(n2 - 1.0) <= 2.0 * _QUATERNION_TOLERANCE:
         return False
+    normalize(q, k, 4, n2)
+    return True
+
+
+@inline_kernel
+def normalize(v: F64, k: int, size: int, n2: float) -> None:
+    """Divide v[k : k + size] by its length √n2, unless that is 1 to the last bit."""
     if abs(n2 - 1.0) > 4e-16:
         scale = 1.0 / math.sqrt(n2)
-        for c in range(4):
-            q[k + c] *= scale
-    return True
+        for c in range(size):
+            v[k + c] *= scale
 
 
 @inline_kernel

@@ -24,7 +24,7 @@ _MOST = 6 * MOST_BLOCKS
 
 @kernel("int64(int64, int64, int64[::1], int64[::1], int64[::1])")
 def dense_omega_update(f0: int, f1: int, reached: I64, graph_table: I64, rows_table: I64) -> int:
-    """Fold factors f0 .. f1−1, linearized at the graph's values, into R and d by (18) and (19) as they stand.
+    """Apply factors f0 .. f1−1, linearized at the graph's values, into R and d by (18) and (19) as they stand.
 
     reached: the positions that the factors reach, at most MOST_BLOCKS.  Gives −1, or a position whose pivot failed.
     """
@@ -35,7 +35,7 @@ def dense_omega_update(f0: int, f1: int, reached: I64, graph_table: I64, rows_ta
         start[t] = size
         size += rec[reached[t], br.DIM]
     T, M, y, z = np.zeros((_MOST, _MOST)), np.empty((_MOST, _MOST)), np.empty(_MOST), np.empty(_MOST)
-    read_tail(reached, start, rows, T, y)
+    read_trailing(reached, start, rows, T, y)
     for i in range(size):
         total = 0.0
         for k in range(i + 1):
@@ -53,12 +53,12 @@ def dense_omega_update(f0: int, f1: int, reached: I64, graph_table: I64, rows_ta
         while t + 1 < reached.size and start[t + 1] <= failed:
             t += 1
         return reached[t]
-    write_tail(reached, start, size, M, z, rows)
+    write_trailing(reached, start, size, M, z, rows)
     return -1
 
 
 @part
-def read_tail(reached: I64, start: I64, rows: BlockRows, T: F64, y: F64) -> None:
+def read_trailing(reached: I64, start: I64, rows: BlockRows, T: F64, y: F64) -> None:
     """The reached rows as one dense matrix, and their part of d."""
     rec, index, numbers, d = rows.rec, rows.index, rows.numbers, rows.d
     for t in range(reached.size):
@@ -157,7 +157,7 @@ def add_many_omega(f: int, reached: I64, start: I64, graph: Graph, place: I64, M
 
 
 @part
-def write_tail(reached: I64, start: I64, size: int, M: F64, z: F64, rows: BlockRows) -> None:
+def write_trailing(reached: I64, start: I64, size: int, M: F64, z: F64, rows: BlockRows) -> None:
     """The rows get all reached positions from their own on, and the numbers of M and z."""
     rec, numbers, d = rows.rec, rows.numbers, rows.d
     for t in range(reached.size):

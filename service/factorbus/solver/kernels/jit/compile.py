@@ -114,7 +114,7 @@ class KernelFolder:
 
     family: names the folder of cache folders, of which the last few are kept.  exact: every operation is rounded as it
     is written, none is fused or reordered: the bits depend neither on how a loop is cut up nor on the processor.
-    quick: exact, and a call keeps the interpreter lock, because it is done before the lock could be given back.
+    quick: exact, and a call keeps the interpreter lock, because it is done before the lock could be released.
     also: files outside the folder whose constants or inline kernels its kernels use.
     """
 

@@ -28,7 +28,7 @@ class InsertDone(NamedTuple):
     published_bytes: int
 
 
-class Account:
+class MapStatistics:
     """One map's.  One thread at a time."""
 
     def __init__(self) -> None:

@@ -1,6 +1,6 @@
 """What a map has done: what is noted is counted when somebody asks, and is in no answer twice."""
 
-from factorbus.service.core.account import Account, InsertDone
+from factorbus.service.core.statistics import InsertDone, MapStatistics
 
 
 def done(chi2: float) -> InsertDone:
@@ -8,12 +8,12 @@ def done(chi2: float) -> InsertDone:
 
 
 def test_what_was_noted_is_in_every_answer_once() -> None:
-    account = Account()
-    account.received(50)
-    account.note(done(1.0))
-    account.stepped("batch", 7.0, 3.0, 5)
+    statistics = MapStatistics()
+    statistics.received(50)
+    statistics.note(done(1.0))
+    statistics.stepped("batch", 7.0, 3.0, 5)
     for _ in range(2):
-        stats, more = account.stats(), account.for_operators()
+        stats, more = statistics.stats(), statistics.for_operators()
         assert stats == {
             "chi2": 7.0,
             "inserts": {"accepted": 1, "refused": 0, "busy": 0},
@@ -26,8 +26,8 @@ def test_what_was_noted_is_in_every_answer_once() -> None:
 
 
 def test_nothing_is_lost_however_much_is_noted() -> None:
-    account = Account()
+    statistics = MapStatistics()
     for n in range(5000):
-        account.note(done(float(n)))
-    stats = account.stats()
+        statistics.note(done(float(n)))
+    stats = statistics.stats()
     assert (stats["inserts"]["accepted"], stats["chi2"], stats["solver_ms"]) == (5000, 4999.0, 10_000.0)

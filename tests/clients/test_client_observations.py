@@ -18,8 +18,8 @@ RADTAN = Camera("radtan", (400.0, 401, 320, 240, -0.25, 0.125, 0.001, -0.002))
 KEY = symbol("f", 1)
 
 
-def test_a_draft_of_sights_is_the_golden_insert() -> None:
-    golden = codec.decode_insert((VECTORS / "insert_sights.msgpack").read_bytes()).batch
+def test_a_draft_of_observations_is_the_golden_insert() -> None:
+    golden = codec.decode_insert((VECTORS / "insert_observations.msgpack").read_bytes()).batch
     radial = golden.factors[2].measured[0, 3:]
     camera = Camera("radial", (radial[0] * radial[5], *radial[[5, 6, 2, 3, 7, 8]]))
     draft = Draft().se3("x1", (0, 0, 0, 0, 0, 0, 1)).se3("x2", (0.5, 0, 0, 0, 0, 0, 1)).idp("f1")

@@ -1,6 +1,6 @@
-"""The words of the wire as a table for kernels: what readers look up and writers copy.
+"""The tokens of the wire as a table for kernels: what readers look up and writers copy.
 
-`WORDS` has a row for each, `LETTERS` their bytes one after the other.  The rows of kinds and losses are made from the
+`TOKENS` has a row for each, `LETTERS` their bytes one after the other.  The rows of kinds and losses are made from the
 solver's tables, so a new one needs nothing here.
 """
 
@@ -10,7 +10,7 @@ from factorbus.service.kernels.compile import I64, U8, inline_kernel
 from factorbus.solver.graph.factors import FACTOR_KINDS, LOSSES
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 
-# Columns of `WORDS`.
+# Columns of `TOKENS`.
 W_ROLE = 0
 W_CODE = 1  # of a field or a piece: below; of a kind: the solver's code
 W_START = 2  # in `LETTERS`
@@ -59,7 +59,7 @@ _PIECES = (
 
 _MAY_BE_NIL = {"values", "stamps", "scale", "loss"}
 
-# The longest string that MessagePack gives a head of one byte; others are no words.
+# The longest string that MessagePack gives a head of one byte; others are no tokens.
 LONGEST = 31
 
 
@@ -80,24 +80,24 @@ def _table() -> tuple[I64, U8]:
         (k.name.encode(), FACTOR_KIND, k.code, (len(k.connects), k.size, k.triangle)) for k in FACTOR_KINDS.values()
     ]
     rows += [(name.encode(), LOSS_NAME, code, ()) for name, code in LOSSES.items()]
-    words, letters = np.zeros((len(rows), W_WIDTH), np.int64), b""
-    for row, (name, role, code, sizes) in zip(words, rows, strict=True):
+    tokens, letters = np.zeros((len(rows), W_WIDTH), np.int64), b""
+    for row, (name, role, code, sizes) in zip(tokens, rows, strict=True):
         row[: W_ARITY + len(sizes)] = role, code, len(letters), len(name), *sizes
         letters += name
-    return words, np.frombuffer(letters, np.uint8).copy()
+    return tokens, np.frombuffer(letters, np.uint8).copy()
 
 
-WORDS, LETTERS = _table()
+TOKENS, LETTERS = _table()
 
 
 @inline_kernel
 def look_up(raw: bytes, start: int, length: int, role: int) -> int:
     """The row of the word raw[start : start + length] among those of a role, or −1."""
-    for row in range(WORDS.shape[0]):
-        if WORDS[row, W_ROLE] == role and WORDS[row, W_LENGTH] == length:
+    for row in range(TOKENS.shape[0]):
+        if TOKENS[row, W_ROLE] == role and TOKENS[row, W_LENGTH] == length:
             same, k = True, 0
             while same and k < length:
-                same = raw[start + k] == LETTERS[WORDS[row, W_START] + k]
+                same = raw[start + k] == LETTERS[TOKENS[row, W_START] + k]
                 k += 1
             if same:
                 return row
@@ -108,6 +108,6 @@ def look_up(raw: bytes, start: int, length: int, role: int) -> int:
 def row_of_variables(code: int) -> int:
     """The row of a kind of variables."""
     row = 0
-    while WORDS[row, W_ROLE] != VARIABLE_KIND or WORDS[row, W_CODE] != code:
+    while TOKENS[row, W_ROLE] != VARIABLE_KIND or TOKENS[row, W_CODE] != code:
         row += 1
     return row

@@ -1,9 +1,9 @@
-"""Random cameras, states and sightings for tests, from a seed."""
+"""Random cameras, states and observations for tests, from a seed."""
 
 import numpy as np
 
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import Sighting
+from factorbus.proto.features import Observations
 
 CAMERAS = {
     "radial": Camera("radial", (2.1735, 0.0112, 0.0112, 160.22, 128.87, 0.06333, 0.0139), 320, 240),
@@ -36,10 +36,12 @@ def random_pixels(rng: np.random.Generator, camera: Camera, n: int, border: floa
     return rng.uniform(border * size, (1 - border) * size, (n, 2))
 
 
-def random_sighting(seed: int, n: int, existing: int = 0, camera: str = "radial") -> tuple[Sighting, np.ndarray]:
-    """(sighting, P) of n pixels, with a filter that has `existing` features."""
+def random_observations(
+    seed: int, n: int, existing: int = 0, camera: str = "radial"
+) -> tuple[Observations, np.ndarray]:
+    """(observations, P) of n pixels, with a filter that has `existing` features."""
     rng = np.random.default_rng(seed)
     P = random_covariance(rng, 13 + 6 * existing)
     seen = CAMERAS[camera]
     sigmas = rng.uniform(0.3, 2.0, 3).tolist()
-    return Sighting(seen, random_state(rng), P[:13], random_pixels(rng, seen, n), *sigmas), P
+    return Observations(seen, random_state(rng), P[:13], random_pixels(rng, seen, n), *sigmas), P

@@ -1,13 +1,13 @@
-"""Random sights of cameras in a map: who sees what, and the measurement, from a seed."""
+"""Random observations of cameras in a map: who sees what, and the measurement, from a seed."""
 
 import numpy as np
 from naive import dense_idp
 from naive.dense_factors import boxplus
-from naive.random_sightings import CAMERAS, random_pixels
+from naive.random_cameras import CAMERAS, random_pixels
 
 from factorbus.proto.camera import Camera
 
-SIGHTS = ("idp_first", "idp_seen", "point_seen")
+CAMERA_KINDS = ("idp_first", "idp_seen", "point_seen")
 
 
 def state_of(pose: np.ndarray) -> np.ndarray:
@@ -20,7 +20,7 @@ def measurement(kind: str, camera: Camera, pixel: np.ndarray, rho: float = 0.4) 
     return np.concatenate([pixel, [rho] if kind == "idp_first" else [], camera.lens()])
 
 
-def random_sight(
+def random_camera_factor(
     kind: str, rng: np.random.Generator, name: str | None = None
 ) -> tuple[Camera, list[np.ndarray], np.ndarray]:
     """(camera, [pose, feature or point], measurement): it looks from near where the feature was first seen."""

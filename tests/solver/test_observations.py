@@ -6,9 +6,9 @@ import pytest
 from naive import dense_idp
 from naive.dense_factors import boxplus, camera_of
 from naive.dense_least_squares import DenseGraph, distance, rho, weight
+from naive.random_camera_factors import CAMERA_KINDS, measurement, random_camera_factor, state_of
+from naive.random_cameras import CAMERAS
 from naive.random_graphs import camera_steps
-from naive.random_sightings import CAMERAS
-from naive.random_sights import SIGHTS, measurement, random_sight, state_of
 from naive.solver_parts import graph_in
 
 from factorbus.proto.camera import Camera
@@ -33,7 +33,7 @@ def unit(dim: int) -> np.ndarray:
     return np.eye(dim)[np.triu_indices(dim)][None]
 
 
-def sight_map(
+def observation_map(
     kind: str, pose: np.ndarray, end: np.ndarray, z: np.ndarray, loss: str = "", scale: float = 1.0
 ) -> Solver:
     """A map of one camera, one thing that it sees, and priors on all."""
@@ -61,11 +61,11 @@ def evaluated(solver: Solver, factor: int = 0) -> tuple[np.ndarray, np.ndarray, 
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-@pytest.mark.parametrize("kind", SIGHTS)
+@pytest.mark.parametrize("kind", CAMERA_KINDS)
 def test_every_lens_gives_the_residual_of_the_dense_twin(kind: str, name: str) -> None:
     for seed in range(4):
-        camera, (pose, end), z = random_sight(kind, np.random.default_rng(seed), name)
-        r, _, _ = evaluated(sight_map(kind, pose, end, z))
+        camera, (pose, end), z = random_camera_factor(kind, np.random.default_rng(seed), name)
+        r, _, _ = evaluated(observation_map(kind, pose, end, z))
         if kind == "point_seen":
             pixel = dense_idp.pixel(camera, dense_idp.matrix(pose[[6, 3, 4, 5]]).T @ (end - pose[:3]))
         else:
@@ -113,7 +113,7 @@ def test_robust_estimates_are_where_the_twins_gradient_is_zero(loss: str, mode: 
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("kind", [*SIGHTS, "between_se3"])
+@pytest.mark.parametrize("kind", [*CAMERA_KINDS, "between_se3"])
 def test_a_loss_weighs_residual_and_jacobians_by_its_slope(kind: str, loss: str) -> None:
     rng = np.random.default_rng(5)
     for shift in (0.1, 1.0, 3.0, 60.0):
@@ -126,9 +126,9 @@ def test_a_loss_weighs_residual_and_jacobians_by_its_slope(kind: str, loss: str)
                 maps.append(Solver())
                 maps[-1].stage(Batch((Variables("se3", np.array([0, 1]), np.array(poses)),), (factor,)))
         else:
-            _, (pose, end), z = random_sight(kind, rng, "radtan")
+            _, (pose, end), z = random_camera_factor(kind, rng, "radtan")
             z[0] += shift
-            maps = [sight_map(kind, pose, end, z), sight_map(kind, pose, end, z, loss, 2.0)]
+            maps = [observation_map(kind, pose, end, z), observation_map(kind, pose, end, z, loss, 2.0)]
         (r, A, B), (r_w, A_w, B_w) = map(evaluated, maps)
         dim = FACTOR_KINDS[kind].dim
         s = r[:dim] @ r[:dim]
@@ -144,9 +144,9 @@ def test_a_loss_weighs_residual_and_jacobians_by_its_slope(kind: str, loss: str)
         assert maps[1].step().chi2_before == pytest.approx(rho(loss, 2.0, s) + priors, rel=1e-9)
 
 
-def test_a_feature_without_a_value_is_where_its_first_sight_has_no_residual() -> None:
+def test_a_feature_without_a_value_is_where_its_first_observation_has_no_residual() -> None:
     for name, camera in CAMERAS.items():
-        _, (pose, _), z = random_sight("idp_first", np.random.default_rng(7), name)
+        _, (pose, _), z = random_camera_factor("idp_first", np.random.default_rng(7), name)
         solver = Solver()
         solver.stage(
             Batch(
@@ -183,9 +183,13 @@ def downwards(z: np.ndarray) -> Batch:
 
 
 REFUSED = {
-    "behind": ("bad_sight", "behind", point_batch(measurement("point_seen", PINHOLE, CENTRE), BEHIND)),
-    "no ray": ("bad_sight", "one to one", point_batch(measurement("point_seen", FOLDING, np.array([900.0, 240])))),
-    "vertical": ("bad_sight", "azimuth", downwards(measurement("idp_first", PINHOLE, CENTRE))),
+    "behind": ("bad_observation", "behind", point_batch(measurement("point_seen", PINHOLE, CENTRE), BEHIND)),
+    "no ray": (
+        "bad_observation",
+        "one to one",
+        point_batch(measurement("point_seen", FOLDING, np.array([900.0, 240]))),
+    ),
+    "vertical": ("bad_observation", "azimuth", downwards(measurement("idp_first", PINHOLE, CENTRE))),
     "model": ("bad_lens", "model 7", point_batch(lens(0, 7.0))),
     "focal length": ("bad_lens", "focal", point_batch(lens(1, 0.0))),
     "limit": ("bad_lens", "limit", point_batch(lens(5, -1.0))),
@@ -212,7 +216,7 @@ def test_losses_that_are_none_are_refused(loss: str, scale: np.ndarray | None) -
 
 
 @pytest.mark.parametrize("mode", ["all-batch", "inc-l", "bayes-tree"])
-def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> None:
+def test_an_observation_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> None:
     """A strong prior pulls a point behind the camera that saw it."""
     solver = Solver(Options(mode=mode))
     solver.stage(point_batch(measurement("point_seen", PINHOLE, CENTRE)))
@@ -229,12 +233,12 @@ def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> N
     place = (weak + 1e6 * strong) / (1e6 + 1)
     np.testing.assert_allclose(solver.estimate()[-1].values[0], place, atol=1e-6)
     assert solver.chi2() == pytest.approx(INACTIVE_CHI2 + 16.0, rel=1e-3)
-    accounts = why_variable(
+    explained = why_variable(
         CovarianceBlocks(solver.covariances.factored()), graph_in(solver).find(P), keeps_steps=False
     ).factors
-    assert [account.inactive for account in accounts] == ["", why, ""]
-    assert (accounts[1].influence, accounts[1].weight, accounts[1].rho) == (0.0, 0.0, INACTIVE_CHI2)
-    assert (accounts[1].residual.tolist(), accounts[1].without) == ([0.0, 0.0], INACTIVE_CHI2)
+    assert [each.inactive for each in explained] == ["", why, ""]
+    assert (explained[1].influence, explained[1].weight, explained[1].rho) == (0.0, 0.0, INACTIVE_CHI2)
+    assert (explained[1].residual.tolist(), explained[1].without) == ([0.0, 0.0], INACTIVE_CHI2)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -251,12 +255,12 @@ def test_why_says_what_a_loss_leaves_of_a_factor(loss: str) -> None:
         solver.stage(Batch((Variables("point3", np.array([P]), places[:1]),), (first, soft)))
         solver.step(settle=True)
         s = float(np.sum((solver.estimate()[0].values[0] - places[1]) ** 2))
-        account = why_factor(CovarianceBlocks(solver.covariances.factored()), 1)
-        assert (account.loss, account.inactive) == (loss, "")
-        assert account.weight == pytest.approx(weight(loss, 2.0, s), rel=1e-6)
-        assert account.chi2 == pytest.approx(s, rel=1e-6)
-        np.testing.assert_allclose(account.residual, solver.estimate()[0].values[0] - places[1], rtol=1e-6)
-        assert account.rho + float(
+        explained = why_factor(CovarianceBlocks(solver.covariances.factored()), 1)
+        assert (explained.loss, explained.inactive) == (loss, "")
+        assert explained.weight == pytest.approx(weight(loss, 2.0, s), rel=1e-6)
+        assert explained.chi2 == pytest.approx(s, rel=1e-6)
+        np.testing.assert_allclose(explained.residual, solver.estimate()[0].values[0] - places[1], rtol=1e-6)
+        assert explained.rho + float(
             why_factor(CovarianceBlocks(solver.covariances.factored()), 0).chi2
         ) == pytest.approx(solver.chi2())
         plain = why_factor(CovarianceBlocks(solver.covariances.factored()), 0)
