@@ -16,7 +16,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, row_of_pair
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, multiply
-from factorbus.solver.kernels.model.many import Many, linearize_many, square_of
+from factorbus.solver.kernels.model.many import Many, linearize_many, square_of, width_of
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
@@ -69,7 +69,7 @@ def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
     var, fac, out, link, state, totals = graph.var, graph.fac, tree.hessian, tree.link, tree.state, tree.totals
     more, many = linearize_many(f, var, fac, tree.lin[0], graph.payload)
     dim, ends = len(many.W), many.start.size - 1
-    last = link[f, tl.L_AT] + hessian_size(many.start[1], many.start[2] - many.start[1]) - 1
+    last = link[f, tl.L_AT] + hessian_size(width_of(0, many), width_of(1, many)) - 1
     was, WJ = load(out, last), np.zeros(many.J.shape)
     for a in range(dim):
         for b in range(dim):
@@ -78,7 +78,7 @@ def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
     for n in range(ends):
         for m in range(n + 1, ends):
             row = row_of_pair(f, n, m, ends)
-            h, di, dj = link[row, tl.L_AT], many.start[n + 1] - many.start[n], many.start[m + 1] - many.start[m]
+            h, di, dj = link[row, tl.L_AT], width_of(n, many), width_of(m, many)
             _block_of(n == 0 and m == 1, many, WJ, n, n, h, out)
             _block_of(True, many, WJ, n, m, h + di * di, out)
             _block_of(n == 0, many, WJ, m, m, h + di * di + di * dj, out)
