@@ -14,7 +14,7 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 
 def test_rows_and_targets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ask, "problem", lambda name, poses: SIMULATED[0].shortened(120))
+    monkeypatch.setattr(ask, "problem_named", lambda name, poses: SIMULATED[0].shortened(120))
     monkeypatch.setattr(ask, "_CANDIDATES", 200)
     found = ask.run(120)
     assert len(found["targets"]) == 5

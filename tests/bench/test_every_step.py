@@ -346,7 +346,7 @@ def test_what_is_asked_wrongly_is_told(
 def test_every_benchmark_of_the_command_line_has_its_file() -> None:
     names = (*bench.BENCHES, *bench.ASKED, *bench.LONG)
     assert "every-step" in names
-    assert all((bench.folder() / bench.file_of(name)).is_file() for name in names)
+    assert all((bench.folder() / bench.bench_file(name)).is_file() for name in names)
 
 
 @pytest.mark.data

@@ -57,7 +57,7 @@ def test_a_title_is_as_wide_as_it_is(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_fields_of_a_journal_are_rounded_and_empty_ones_left_away() -> None:
     fields = {"durability": "commit", "commits": 31, "commit_ms": 332.3176280064217, "longest_commit_ms": 12345.6}
-    told = dict(stats.shown(fields | {"problem": "", "seconds": 0.0123456}))
+    told = dict(stats.shown_fields(fields | {"problem": "", "seconds": 0.0123456}))
     assert told == {
         "durability": "commit",
         "commits": "31",

@@ -31,6 +31,7 @@ import sys
 import numpy as np
 from naive.dense_factors import jacobians, residual
 from naive.random_graphs import random_value
+from naive.solver_parts import graph_in
 
 from factorbus.client import Draft
 from factorbus.client.merging import AbsoluteFactors, fit_into

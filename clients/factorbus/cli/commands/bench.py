@@ -62,7 +62,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     for each in names:
         print_note(f"bench {each}")
         ran = subprocess.run(
-            [sys.executable, str(where / file_of(each)), *(["--json"] if as_json else []), *options],
+            [sys.executable, str(where / bench_file(each)), *(["--json"] if as_json else []), *options],
             stdout=subprocess.PIPE if as_json else None,
             text=True,
             check=False,
@@ -81,7 +81,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
 def folder() -> Path:
     """tests/bench of the checkout that this package is installed from.  Raises Stopped."""
     found = Path(__file__).resolve().parents[4] / "tests" / "bench"
-    if not all((found / file_of(name)).is_file() for name in (*BENCHES, *ASKED, *LONG)):
+    if not all((found / bench_file(name)).is_file() for name in (*BENCHES, *ASKED, *LONG)):
         raise Stopped(
             "no_repository",
             "the benchmarks are not part of the installed package: clone the repository and run `make bench` there",
@@ -89,7 +89,7 @@ def folder() -> Path:
     return found
 
 
-def file_of(name: str) -> str:
+def bench_file(name: str) -> str:
     """The file of a benchmark."""
     return f"{name.replace('-', '_')}.py"
 

@@ -70,7 +70,7 @@ def _rows(service: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield f"map {row['name']}", _map(row)
     for row in service.get("unopened", ()):
         yield f"map {row['name']}", f"does not open ({row['state']}): {row['problem']}"
-    for name, value in shown(service.get("journal", {})):
+    for name, value in shown_fields(service.get("journal", {})):
         yield f"journal {name}", value
 
 
@@ -85,12 +85,12 @@ def _map(row: Mapping[str, Any]) -> str:
         f"{inserts['busy']} answered busy; {row['waiting']} waiting, {row['parked']} parked; "
         f"{counted(row['clients'], 'client')}",
         *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
-        *(f"journal {name}: {value}" for name, value in shown(row.get("journal", {}))),
+        *(f"journal {name}: {value}" for name, value in shown_fields(row.get("journal", {}))),
     ]
     return "\n".join(lines)
 
 
-def shown(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def shown_fields(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Fields that have something to say: names in words, times to three digits."""
     for name, value in fields.items():
         if value not in ("", None):
