@@ -25,6 +25,7 @@ from factorbus.solver.kernels.model.se3 import compose_se3, rotation_matrix
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, kind_of_end, residual_dim, scale_at
 
 POSE = 7  # numbers of a pose, at most
+FIRST, SECOND, MOUNT = range(3)  # the variables of what a sensor measures
 
 
 class Many(NamedTuple):
@@ -57,6 +58,12 @@ def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
     if loss != at.NO_LOSS:
         more = soften_many(loss, payload[fac[f, at.F_AT] + scale_at(kind)], more, many)
     return more, many
+
+
+@inline_kernel
+def width_of(n: int, many: Many) -> int:
+    """Scalars of the n-th variable."""
+    return many.start[n + 1] - many.start[n]
 
 
 @inline_kernel
@@ -102,27 +109,27 @@ def at_mount(kind: int, x: F64, places: I64, p: F64, k: int, many: Many) -> floa
 
     places: where the values of the variables begin in x; the measurement is at p[k].
     """
-    of, m, dim = base_kind(kind), places[2], residual_dim(kind)
+    of, m, dim = base_kind(kind), places[MOUNT], residual_dim(kind)
     planar = kind_of_end(kind, 0) == at.SE2
     joins_poses = kind_of_end(kind, 1) == kind_of_end(kind, 0)
     A, B, y = np.zeros((6, 6)), np.zeros((6, 6)), np.empty(3 * POSE)
     copy_pose(planar, x, m, y, 0)
-    put_sensor(planar, x, places[0], y, POSE)
+    put_sensor(planar, x, places[FIRST], y, POSE)
     if joins_poses:
-        put_sensor(planar, x, places[1], y, 2 * POSE)
+        put_sensor(planar, x, places[SECOND], y, 2 * POSE)
     else:
         for c in range(2 if planar else 3):
-            y[2 * POSE + c] = x[places[1] + c]
+            y[2 * POSE + c] = x[places[SECOND] + c]
     more = residual_of(of, y, Ends(POSE, 2 * POSE), p, k, many.r, A, B)
-    _carry_over(dim, planar, y, A, many.J, many.start[0])
+    _carry_over(dim, planar, y, A, many.J, many.start[FIRST])
     if joins_poses:
-        _carry_over(dim, planar, y, B, many.J, many.start[1])
+        _carry_over(dim, planar, y, B, many.J, many.start[SECOND])
     for a in range(dim):
-        for c in range(many.start[3] - many.start[2]):
-            many.J[a, many.start[2] + c] = A[a, c] + (B[a, c] if joins_poses else 0.0)
+        for c in range(width_of(MOUNT, many)):
+            many.J[a, many.start[MOUNT] + c] = A[a, c] + (B[a, c] if joins_poses else 0.0)
         if not joins_poses:
-            for c in range(many.start[2] - many.start[1]):
-                many.J[a, many.start[1] + c] = B[a, c]
+            for c in range(width_of(SECOND, many)):
+                many.J[a, many.start[SECOND] + c] = B[a, c]
     return more
 
 
