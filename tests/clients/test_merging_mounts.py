@@ -9,8 +9,8 @@ from naive.random_mounts import CAMERA_MOUNT, SPACE_MOUNT, mount_steps, true_mou
 from factorbus.client import Draft
 from factorbus.client.frames import compose
 from factorbus.client.merging import fit_into
-from factorbus.client.mounts import mounts_of
 from factorbus.proto.messages import Batch, Estimate, Factors, MapGraph, Variables
+from factorbus.proto.mounts import mounts_of
 from factorbus.proto.symbols import parse_symbol, symbol
 from factorbus.solver import Options, Solver
 

@@ -189,3 +189,14 @@ def test_seconds_are_exact(stamp: int) -> None:
     (time,) = times(tum_text(Batch((poses([stamp]),))))
     assert Decimal(time) * 10**9 == stamp
     assert len(time.split(".")[1]) == 9
+
+
+def test_a_mount_is_no_robot() -> None:
+    """It is a pose on the robot: no trajectory of its own, and so no choice of a robot where there is one."""
+    mount = Variables("se2", np.array([symbol("m", 0)]), np.array([[0.1, 0.2, 0.3]]))
+    way = Factors(
+        "between_se2_mount", np.array([[symbol("x", 0), symbol("x", 1), symbol("m", 0)]]), np.array([[1.0, 0, 0]]),
+        np.array([[1.0, 0, 0, 1, 0, 1]]),
+    )  # fmt: skip
+    rows = tum_text(Batch((poses(None), mount), (way,))).splitlines()
+    assert [row.split()[0] for row in rows] == ["0", "1", "2"]

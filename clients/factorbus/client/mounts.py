@@ -1,18 +1,11 @@
-"""Mounts of sensors in a graph: poses on a robot, which are not in the map's frame and do not move with it."""
+"""A graph apart from the mounts of its sensors, which do not move with the map."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from factorbus.proto.arrays import I64
-from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
-
-
-def mounts_of(batch: Batch) -> I64:
-    """The keys of the mounts: the last variables of factors of the kinds that have one."""
-    found = [group.keys[:, -1] for group in batch.factors if FACTOR_KINDS[group.kind].base]
-    return np.unique(np.concatenate([np.empty(0, np.int64), *found]))
+from factorbus.proto.mounts import mounts_of
 
 
 def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
