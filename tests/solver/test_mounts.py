@@ -5,13 +5,14 @@ import pytest
 from naive.dense_covariances import DenseCovariance
 from naive.dense_factors import boxplus, pose_matrix, pose_vector, residual
 from naive.dense_least_squares import DenseGraph, distance, full
-from naive.random_mounts import MOUNTED, mount_steps
+from naive.random_mounts import MOUNTED, mount_steps, true_mounts
 from naive.solver_parts import keys_in, kinds_in, linearization_points
 
-from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import FactorGroup, Options, Solver, errors
 from factorbus.solver.changes.repair import repair
+from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.why import why_factor, why_variable
@@ -254,3 +255,54 @@ def test_repair_takes_out_what_a_sensor_saw_wrongly_and_keeps_the_mount() -> Non
         row for g in found.groups for k, row in zip(g.keys.tolist(), g.values, strict=True) if k == symbol("m", 0)
     )
     np.testing.assert_allclose(mounts, mount, atol=0.05)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("held", ["poses", "points", "both", "mounts", "poses and mounts"])
+def test_whatever_is_fixed_the_estimate_is_the_dense_optimum(held: str, mode: str) -> None:
+    """With poses and points held the first row of a factor joins nothing that is free: its χ² is a constant."""
+    solver, twin, mounts = Solver(Options(mode=mode)), DenseGraph(), set(true_mounts())
+    known = {"both": ("poses", "points"), "poses and mounts": ("poses", "mounts")}.get(held, (held,))
+    truth = Solver(Options())
+    for batch in mount_steps(11, 5):
+        truth.stage(batch)
+        truth.step()
+    truth.step(settle=True)
+    at = {key: row + 0.01 for key, (kind, row) in by_key(truth).items() if kind in ("se2", "point2", "point3")}
+
+    def as_held(group: Variables) -> Variables:
+        of = "mounts" if int(group.keys[0]) in mounts else "points" if group.kind.startswith("point") else "poses"
+        if of not in known:
+            return group
+        value = at.get(int(group.keys[0]), by_key(truth)[int(group.keys[0])][1])
+        return group._replace(values=value[None], fixed=True)
+
+    for batch in mount_steps(11, 5):
+        given = Batch(tuple(as_held(group) for group in batch.variables), batch.factors)
+        solver.stage(given)
+        report = solver.step()
+        twin.add(given)
+        twin.put(solver.estimate())
+        assert report.chi2 == pytest.approx(twin.chi2(), rel=1e-9)
+    solver.step(settle=True)
+    twin.put(solver.estimate())
+    assert solver.chi2() == pytest.approx(twin.chi2(), rel=1e-9)
+    assert twin.gauss_newton(iterations=1) < 1e-7
+    # A factor whose pose and point are held gets a loss, and another goes.
+    rows = [n for n, each in enumerate(_by_id(solver)) if each[0].startswith("landmark")]
+    changes = [
+        Change("loss", np.array(rows[:2]), loss="huber", scale=np.ones(2)),
+        Change("remove_factors", np.array(rows[2:3])),
+    ]
+    changed, _, report, counted = with_changes(solver, changes)
+    came = try_change(solver, changes)
+    assert (counted["edited_factors"], counted["removed_factors"]) == (2, 1)
+    assert (came is not None) == (mode == "bayes-tree")
+    for each in (changed, solver) if came else (changed,):
+        each.step(settle=True)
+        left = DenseGraph()
+        groups, factors = each.graph()
+        left.add(Batch(tuple(groups), tuple(factors)))
+        left.put(each.estimate())
+        assert each.chi2() == pytest.approx(left.chi2(), rel=1e-9)
+        assert left.gauss_newton(iterations=1) < 1e-6
