@@ -234,7 +234,7 @@ def test_a_robot_log_is_replayed_converted_and_held_against_its_truth(
     told = json.loads(capsys.readouterr().out)
     assert (told["read"]["ground_truth"], told["error_m"]["poses"]) == (12, 12)
     assert 0 < told["error_m"]["rms"] < told["error_m"]["max"] < 1
-    assert read(folder / "c.jrl").account()["ground_truth"] == 12
+    assert read(folder / "c.jrl").summary()["ground_truth"] == 12
     assert main(["convert", "a.jrl", "d.g2o"]) == OK
     assert "12 ground truth values left out: g2o has no place to say so" in capsys.readouterr().err
     assert main(["convert", "a.jrl", "d.g2o", "--strict"]) == BAD_FILE

@@ -9,10 +9,11 @@ from naive.random_mounts import CAMERA_MOUNT, SPACE_MOUNT, mount_steps, true_mou
 from factorbus.client import Draft
 from factorbus.client.frames import compose
 from factorbus.client.merging import fit_into
-from factorbus.proto.messages import Batch, Estimate, Factors, MapGraph, Variables
+from factorbus.proto.messages import Batch, Change, Estimate, Factors, MapGraph, Variables
 from factorbus.proto.mounts import mounts_of
 from factorbus.proto.symbols import parse_symbol, symbol
 from factorbus.solver import Options, Solver
+from factorbus.solver.changing import with_changes
 
 LETTERS = {"y": "z"}
 
@@ -101,3 +102,30 @@ def rows_of(batch: Batch) -> dict[int, tuple[np.ndarray, bool]]:
         assert g.values is not None
         found |= {key: (row, g.fixed) for key, row in zip(g.keys.tolist(), g.values, strict=True)}
     return found
+
+
+@pytest.mark.parametrize("absolute", ["leave_out", "keep"])
+def test_what_was_known_of_a_mount_together_with_others_goes_whole_or_not_at_all(absolute: str) -> None:
+    """Once something is marginalized the mount is in a linear factor in pieces."""
+    solver = Solver(Options())
+    for batch in mount_steps(3, 5):
+        plane = tuple(group for group in batch.variables if group.kind in ("se2", "point2"))
+        solver.stage(Batch(plane, tuple(g for g in batch.factors if "se2" in g.kind or g.kind == "prior_point2")))
+        solver.step()
+    solver.step(settle=True)
+    gone = np.array([symbol("l", 0)])
+    solver = with_changes(solver, [Change("marginalize", keys=gone)], settle=True)[0]
+    variables, factors = solver.graph()
+    groups = tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in variables)
+    other = MapGraph(1, 1, Batch(groups, tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in factors)))
+    pose = Variables("se2", np.array([parse_symbol("w0")]), np.zeros((1, 3)), fixed=True)
+    anchor = Draft().between_se2("w0", "x0", (1, 2, 0.5), sigmas=[0.1] * 3)
+    fitted = fit_into(Estimate(1, 1, (pose,)), other, anchors=anchor, absolute=absolute)
+    target = Solver(Options())
+    target.stage(Batch((pose,)))
+    target.step()
+    target.stage(fitted.batch)
+    target.step(settle=True)
+    kept = [g for g in fitted.batch.factors if g.kind.startswith("linear")]
+    assert bool(kept) == (absolute == "keep")
+    assert target.chi2() < 10 * solver.chi2() + 100

@@ -62,6 +62,7 @@ def information(dim: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def measured(kind: str, rng: np.random.Generator) -> np.ndarray:
+    kind = kind.removesuffix("_mount")
     if kind in CAMERA_KINDS:
         z = measurement(kind, CAMERAS["radtan"], np.zeros(2), number(rng) if kind == "idp_first" else 0.0)
         z[:2] = rng.uniform(0, 500, 2) if rng.random() < 0.7 else numbers(2, rng)
@@ -79,6 +80,9 @@ def measured(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 def connects(kind: str) -> list[str]:
     """The kinds of variables that a kind of factor is on."""
+    if kind.endswith("_mount"):
+        ends = connects(kind.removesuffix("_mount"))
+        return [*ends, ends[0]]
     if kind.startswith("linear"):
         ends = kind.removeprefix("linear_").removeprefix("pair_").split("_")
         return ends * 2 if "pair" in kind and len(ends) == 1 else ends

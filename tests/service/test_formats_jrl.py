@@ -54,7 +54,7 @@ def test_what_a_log_has_beside_the_graph(tmp_path: Path) -> None:
     assert (labels["range_se2"].potential.tolist(), labels["range_se2"].outlier.tolist()) == ([True], [True])
     assert labels["between_se2"].robots.tolist() == [ord("b"), ord("a")]
     assert labels["between_se2"].stamps.tolist() == [T0 + 10, T0 + 20]
-    assert graph.account() == {
+    assert graph.summary() == {
         "dialect": "jrl",
         "notes": list(graph.notes),
         "left_out": {},
@@ -290,3 +290,15 @@ def test_a_time_that_stands_beside_a_value_is_its_own(tmp_path: Path) -> None:
         if stamp != NO_STAMP
     }
     assert stamps == {B0: T0 + 10, A1: T0 + 20, L0: 7}
+
+
+@pytest.mark.parametrize("entry", ["a[0]", "b[0]"])
+def test_a_truth_of_another_kind_than_the_variable_is_refused_with_its_place(tmp_path: Path, entry: str) -> None:
+    """A pose in space where the map is a plane: of a variable that has a value, and of one that has none."""
+    document = json.loads(PLANE)
+    wrong = document["groundtruth"][entry[0]][0]
+    for name in ("x", "y", "theta"):
+        wrong.pop(name, None)
+    wrong |= {"type": "Pose3", "translation": [1, 2, 3], "rotation": [1, 0, 0, 0]}
+    with pytest.raises(FormatError, match=rf"groundtruth\.{entry[0]}\[0\]"):
+        read_text(tmp_path, json.dumps(document))

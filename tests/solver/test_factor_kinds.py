@@ -14,7 +14,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KINDS, FactorKind
-from factorbus.solver.graph.linearized import linearize_factor
+from factorbus.solver.graph.linearized import linearized_factor
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.model import layout as at
 
@@ -59,7 +59,7 @@ def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Fac
 
 
 def evaluate(kind: FactorKind, graph: FactorGraph) -> tuple[np.ndarray, list[np.ndarray]]:
-    linear = linearize_factor(graph, 0)
+    linear = linearized_factor(graph, 0)
     return linear.r, [linear.jacobian_of(v) for v in range(len(kind.connects))]
 
 

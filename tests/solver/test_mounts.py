@@ -254,7 +254,7 @@ def test_repair_takes_out_what_a_sensor_saw_wrongly_and_keeps_the_mount() -> Non
     mounts = next(
         row for g in found.groups for k, row in zip(g.keys.tolist(), g.values, strict=True) if k == symbol("m", 0)
     )
-    np.testing.assert_allclose(mounts, mount, atol=0.05)
+    np.testing.assert_allclose(mounts, mount, atol=0.1)  # of a circle little shows what is forward
 
 
 @pytest.mark.parametrize("mode", MODES)

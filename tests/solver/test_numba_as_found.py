@@ -47,7 +47,8 @@ def compiled():
     assert pick(a, -2) == 9.0 and like_ours(a, -1) == 15.0
     assert [part.tolist() for part in rows(a.reshape(2, 3), 2)] == [[3.0, 5.0, 7.0], [3.0, 4.0, 5.0]]
     text = "".join(ir for one in (pick, rows, like_ours) for ir in one.inspect_llvm().values())
-    return re.sub(r"B(\\d+)v\\d+", "B", text)
+    # Functions are numbered as they are made, and so the names that have the number are of another length.
+    return re.sub(r"\\[\\d+ x i8\\] c.missing", "missing", re.sub(r"B(\\d+)v\\d+", "B", text))
 
 def show(*moments):
     assert inside() == found

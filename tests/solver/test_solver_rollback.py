@@ -17,7 +17,7 @@ BATCH = Options(mode="all-batch")
 
 def state(solver: Solver) -> list[bytes]:
     graph, blocks = graph_in(solver), system_in(solver).blocks
-    variables, factors, values, payload, columns, scalars, _ = graph.counts.tolist()
+    variables, factors, values, payload, columns, scalars, *_ = graph.counts.tolist()
     arrays = [
         *(graph.keys[:variables], graph.var[:variables], graph.fac[:factors], graph.values[:values]),
         *(graph.payload[:payload], graph.dims[:columns], graph.stamps[:variables], graph.counts),

@@ -9,7 +9,10 @@ from factorbus.proto.mounts import mounts_of
 
 
 def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
-    """(mounts, and what is known of them alone; all else)."""
+    """(mounts, and what is known of them alone; all else).
+
+    Linear factors stay together: what one in pieces says of a mount alone is not known without the others.
+    """
     mounts = mounts_of(batch)
     if not mounts.size:
         return Batch(), batch
@@ -21,11 +24,18 @@ def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
                 variables[half].append(_some_variables(group, chosen))
     for group in batch.factors:
         of_mounts = np.asarray(np.isin(group.keys, mounts).all(axis=1))
+        if group.kind.startswith("linear_"):
+            of_mounts[:] = False
         for half, chosen in ((0, of_mounts), (1, ~of_mounts)):
             if chosen.any():
                 factors[half].append(rows_of_group(group, chosen))
     first, second = (Batch(tuple(variables[half]), tuple(factors[half])) for half in (0, 1))
     return first, second
+
+
+def of_the_map(batch: Batch) -> tuple[Variables, ...]:
+    """The variables that are in the frame of the map: all but mounts."""
+    return split_mounts(batch)[1].variables
 
 
 def _some_variables(group: Variables, chosen: np.ndarray) -> Variables:

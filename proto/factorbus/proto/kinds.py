@@ -100,11 +100,6 @@ def _linear(*ends: str) -> FactorKind:
     return FactorKind(name, ends, size, rows, measured, "H₁ (x₁ ⊟ y₁) + H₂ (x₂ ⊟ y₂) + b", example)
 
 
-def _and_with_mounts(kinds: tuple[FactorKind, ...]) -> tuple[FactorKind, ...]:
-    """And those of a sensor whose mount is estimated: of all that one pose measures of another, or of a point."""
-    return (*kinds, *(_with_mount(kind) for kind in kinds if kind.name in _WITH_MOUNT))
-
-
 _WITH_MOUNT = (
     *("between_se2", "between_se3", "landmark_se2", "landmark_se3", "bearing_range_se2", "bearing_se2", "bearing_se3"),
     *("range_se2", "range_se3", "point_seen"),
@@ -118,8 +113,9 @@ def _with_mount(kind: FactorKind) -> FactorKind:
     return replace(kind, name=f"{kind.name}_mount", connects=ends, residual=residual, base=kind.name)
 
 
-_KINDS = _and_with_mounts(
-    (
+FACTOR_KINDS = {
+    kind.name: kind
+    for kind in (
         FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
         FactorKind(
             "prior_se3",
@@ -260,8 +256,9 @@ _KINDS = _and_with_mounts(
         *(_linear(kind, kind) for kind in ("se2", "se3", "point2", "point3", "idp")),
         *(_linear(*b) for b in (("se2", "point2"), ("se3", "point3"), ("se3", "idp"), ("point3", "idp"))),
     )
-)
-FACTOR_KINDS = {kind.name: kind for kind in _KINDS}
+}
+# And those of a sensor whose mount is estimated: of all that one pose measures of another, or of a point.
+FACTOR_KINDS |= {kind.name: kind for kind in (_with_mount(FACTOR_KINDS[name]) for name in _WITH_MOUNT)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,6 +90,7 @@ def read_jrl(file: str, content: bytes, left: LeftOut) -> tuple[Batch, tuple[I64
     rows = _rows(entries, places, left)
     values, truth = (_values(document, name, places, left) for name in ("initialization", "groundtruth"))
     _refuse_clashes(rows, values, places)
+    _refuse_other_truth(values, truth, places)
     with _placed(places):
         edges = [_edges(file, name, of) for name, of in rows.items()]
         vertices, known = ([_vertices(file, *each) for each in of.rows.items()] for of in (values, truth))
@@ -104,6 +105,17 @@ def read_jrl(file: str, content: bytes, left: LeftOut) -> tuple[Batch, tuple[I64
     if told := log.told():
         left.say(told)
     return _stamped(batch, entries, rows, values.stamps), turns, log
+
+
+def _refuse_other_truth(values: _Values, truth: _Values, places: list[Part]) -> None:
+    """The truth of a variable has the type of its value, and all truth is of the plane or all of space."""
+    types = {value.key: name for name, of in values.rows.items() for value in of}
+    every = [(name, value) for name, of in truth.rows.items() for value in of]
+    for name, value in every:
+        if (wanted := types.get(value.key, name)) != name:
+            raise places[value.turn].refused(f"a {wanted}, as its initialization is", f"the truth is a {name}")
+        if name[-1] != every[0][0][-1]:
+            raise places[value.turn].refused(f"all of the plane or all of space, as the {every[0][0]} before", name)
 
 
 def _robots(part: Part | None) -> Iterator[tuple[str, Part]]:

@@ -10,6 +10,7 @@ from factorbus.formats.errors import FormatError
 from factorbus.formats.left_out import LeftOut, shown
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.mounts import mounts_of
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
@@ -44,6 +45,7 @@ def writable(batch: Batch, form: Form, left: LeftOut) -> Batch:
     """What of `batch` there are records for.  Raises FormatError for a factor of a variable that is not there."""
     _refuse_unknown(batch, form.name)
     lost = _Lost()
+    batch = _without_mounts(batch, form, lost)
     variables = []
     for group in batch.variables:
         if group.kind in form.variables:
@@ -85,6 +87,29 @@ def _writable_factors(group: Factors, gone: I64, form: Form, lost: _Lost) -> Fac
     if not kept.any():
         return None
     return Factors(group.kind, group.keys[kept], group.measured[kept], group.information[kept])
+
+
+def _without_mounts(batch: Batch, form: Form, lost: _Lost) -> Batch:
+    """Without the places of sensors on a robot, and all factors on them: as poses of the map they would mislead."""
+    mounts = mounts_of(batch)
+    if not mounts.size:
+        return batch
+    variables, factors, why = [], [], f"{form.name} has no record for where a sensor is on a robot"
+    for group in batch.variables:
+        stays = ~np.isin(group.keys, mounts)
+        lost["mounts", why] += int((~stays).sum())
+        values, stamps = (None if each is None else each[stays] for each in (group.values, group.stamps))
+        if stays.any():
+            variables.append(group._replace(keys=group.keys[stays], values=values, stamps=stamps))
+    for group in batch.factors:
+        stays = ~np.isin(group.keys, mounts).any(axis=1)
+        lost[group.kind, why] += int((~stays).sum())
+        numbers = (None if each is None else each[stays] for each in (group.scale, group.ids))
+        if stays.any():
+            scale, ids = numbers
+            group = group._replace(measured=group.measured[stays], information=group.information[stays])
+            factors.append(group._replace(keys=group.keys[stays], scale=scale, ids=ids))
+    return Batch(tuple(variables), tuple(factors))
 
 
 def _with_values(variables: list[Variables], named: I64, lost: _Lost) -> Iterator[Variables]:

@@ -64,11 +64,16 @@ def command(
 
 
 def _robots(joined: "Map", robot: str | None) -> list[str]:
-    """The letters of the robots to write; "" for keys without one.  Raises Stopped."""
+    """The letters of the robots to write; "" for keys without one.  Mounts are no robots.  Raises Stopped."""
+    from factorbus.proto.mounts import mounts_of
     from factorbus.proto.symbols import symbol_parts
 
-    poses = [group.keys for group in joined.ask_estimate().variables if group.kind in ("se2", "se3")]
-    there = sorted({symbol_parts(key)[0] for keys in poses for key in keys.tolist()})
+    groups = [group.keys for group in joined.ask_estimate().variables if group.kind in ("se2", "se3")]
+    poses = {key for keys in groups for key in keys.tolist()}
+    there = sorted({symbol_parts(key)[0] for key in poses})
+    if len(there) > 1:  # only the factors tell what is a mount
+        poses -= set(mounts_of(joined.graph().batch).tolist())
+        there = sorted({symbol_parts(key)[0] for key in poses})
     if robot is None:
         return there
     if robot not in there:

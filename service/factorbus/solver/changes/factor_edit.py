@@ -95,12 +95,12 @@ class FactorEdit:
         linked = int(edit_factors(self.gone, self.renewed, graph.array_table, tree.array_table, self._log))
         self._linked = linked if linked >= 0 else -1 - linked
         if self.gone.size:
-            last, following = max(graph.ids.size, int(self.gone[-1]) + 1), graph.next_id
+            last = max(graph.ids.size, int(self.gone[-1]) + 1)
             ids = np.delete(graph.ids_of(np.arange(last)), self.gone)
             graph.holes += int(self._widths(self.gone).sum())
             close_gaps(self.gone, graph.array_table, tree.array_table)
             graph.counts[at.MEMBERS] -= self.members
-            graph.name_factors(ids, following)
+            graph.ids, graph.id_shift = ids, graph.id_shift + self.gone.size
             self._closed = True
         return linked >= 0
 

@@ -15,7 +15,7 @@ from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.groups import FactorsLike
-from factorbus.solver.graph.linearized import linearize_factor
+from factorbus.solver.graph.linearized import linearized_factor
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.candidates import evaluate_factors
@@ -88,7 +88,7 @@ def evaluate_rows(blocks: CovarianceBlocks, first: int, last: int) -> Candidates
     found.distance[few], found.gain[few] = pairs.distance, pairs.gain
     found.predicted[few, : pairs.predicted.shape[1], : pairs.predicted.shape[2]] = pairs.predicted
     for k in np.flatnonzero(many).tolist():
-        linear, d = linearize_factor(graph, int(rows[k])), int(sizes[k])
+        linear, d = linearized_factor(graph, int(rows[k])), int(sizes[k])
         T = linear.J @ blocks.joint(linear.ends) @ linear.J.T
         found.predicted[k, :d, :d] = T
         root = np.linalg.cholesky(linear.W)

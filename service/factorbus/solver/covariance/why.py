@@ -12,7 +12,7 @@ from factorbus.solver.graph import observations
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import losses_of, rows_of_factors, with_losses
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
-from factorbus.solver.graph.linearized import Linearized, linearize_factor
+from factorbus.solver.graph.linearized import Linearized, linearized_factor
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.jit.compile import F64
@@ -121,7 +121,7 @@ def why_variable(blocks: CovarianceBlocks, variable: int, keeps_steps: bool) -> 
 
 
 def _why_row(blocks: CovarianceBlocks, row: int) -> FactorExplanation:
-    linear = linearize_factor(blocks.factored.graph, row)
+    linear = linearized_factor(blocks.factored.graph, row)
     return _explained(blocks, row, linear, linear.J @ blocks.joint(linear.ends) @ linear.J.T)
 
 
@@ -135,7 +135,7 @@ def _pivot(blocks: CovarianceBlocks, variable: int, factors: list[int]) -> tuple
     pivots = np.array([tree.numbers[row[tl.C_ROWS] + i * row[tl.C_LD] + i] for i in range(first, first + d)])
     diagonal = np.zeros(d)
     for factor in factors:
-        linear = linearize_factor(f.graph, factor)
+        linear = linearized_factor(f.graph, factor)
         H = linear.jacobian_of(variable)
         diagonal += np.einsum("ai,ab,bi->i", H, linear.W, H)
     return float(pivots.min()), float((pivots**2 / diagonal).min())
@@ -170,7 +170,7 @@ def _plain(graph: FactorGraph, row: int) -> tuple[F64, float]:
     plain = copy.copy(graph)
     plain.fac = graph.fac[: row + int(rows_of_factors(graph.fac, np.array([row])).size)].copy()
     plain.fac[row, at.F_FLAGS] = with_losses(plain.fac[row, at.F_FLAGS], at.NO_LOSS)
-    return linearize_factor(plain, row).r, _chi2(plain, row)
+    return linearized_factor(plain, row).r, _chi2(plain, row)
 
 
 def _chi2(graph: FactorGraph, row: int) -> float:

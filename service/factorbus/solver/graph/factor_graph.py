@@ -15,7 +15,7 @@ import numpy as np
 
 from factorbus.solver.errors import printed
 from factorbus.solver.graph.arenas import Arenas, lines
-from factorbus.solver.graph.factor_rows import ends_of_rows, first_rows, is_first, losses_of
+from factorbus.solver.graph.factor_rows import ends_of_rows, first_rows, is_first, losses_of, rows_of_each
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.graph.rows import Rows, Span
@@ -25,7 +25,6 @@ from factorbus.solver.kernels.graph.key_table import enter_keys, find_variable, 
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
-from factorbus.solver.kernels.model.factor_rows import count_rows
 from factorbus.solver.kernels.model.kinds import CAMERA
 from factorbus.solver.kernels.model.retract import common_label, gather_values
 
@@ -39,7 +38,7 @@ class FactorGraph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = records.Graph._fields
-    NOT_KEPT = ("_rows", "_unlisted", "array_table")  # of a solver's state: they follow from the rest
+    NOT_KEPT = ("_rows", "_id_room", "_unlisted", "array_table")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:
         # Room for the first few hundred factors: the step that finds none takes several times as long.
@@ -56,6 +55,7 @@ class FactorGraph(Arenas):
         enter_keys(0, self.table, self.keys)
         self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
         self.id_shift = 0  # of a later row: its id less its number
+        self._id_room: I64 = np.empty(0, np.int64)  # where ids are listed that grow with every insert
         self._unlisted: tuple[I64, int] | None = None  # both as they were before factors had several rows
         self.holes = 0  # numbers of the payload that no factor has any more
         self._rows = Rows()
@@ -100,7 +100,7 @@ class FactorGraph(Arenas):
         self.reserve_variables(sum(counts), sum(n * kind.size for n, kind in zip(counts, kinds, strict=True)))
         widths = [FACTOR_KIND_OF_CODE[code].width for code in factors[:, gt.G_KIND].tolist()]
         counts = factors[:, gt.G_COUNT].tolist()
-        rows = [count_rows(len(FACTOR_KIND_OF_CODE[code].connects)) for code in factors[:, gt.G_KIND].tolist()]
+        rows = [rows_of_each(FACTOR_KIND_OF_CODE[code]) for code in factors[:, gt.G_KIND].tolist()]
         more = sum(n * of_each for n, of_each in zip(counts, rows, strict=True))
         self.reserve_factors(more, sum(n * (width + 1) for n, width in zip(counts, widths, strict=True)))
 
@@ -170,8 +170,12 @@ class FactorGraph(Arenas):
         ids = first_id - 1 + np.cumsum(is_first(self.fac[first:rows]))
         if self._unlisted is None and self.ids.size < first:
             self._unlisted = self.ids, self.id_shift
-        before = self.ids if self.ids.size == first else self.ids_of(np.arange(first))
-        self.name_factors(np.concatenate([before, ids]), int(ids[-1]) + 1 if ids.size else first_id)
+        if self.ids.base is not self._id_room or self.ids.size != first or rows > self._id_room.size:
+            before = self.ids_of(np.arange(first))
+            self._id_room = np.empty(roomy(rows, first), np.int64)
+            self._id_room[:first] = before
+        self._id_room[first:rows] = ids
+        self.name_factors(self._id_room[:rows], int(ids[-1]) + 1 if ids.size else first_id)
 
     def forget_ids(self) -> None:
         """Of rows that are gone, which came last."""

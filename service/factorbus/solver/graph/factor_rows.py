@@ -5,6 +5,7 @@ A factor of more than two variables has a row for each pair of them (`kernels/mo
 
 import numpy as np
 
+from factorbus.solver.graph.factors import FactorKind
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 
@@ -19,6 +20,12 @@ def losses_of(fac: I64) -> I64:
 def with_losses(flags: I64, losses: I64 | int) -> I64:
     """The same flags with other losses."""
     return flags & ~_LOSS | losses << at.LOSS_SHIFT
+
+
+def rows_of_each(kind: FactorKind) -> int:
+    """How many rows a factor of a kind has."""
+    ends = len(kind.connects)
+    return ends * (ends - 1) // 2 if ends > 2 else 1
 
 
 def first_rows(fac: I64) -> I64:
@@ -54,6 +61,6 @@ def ends_of_rows(fac: I64, rows: I64, arity: int) -> I64:
     return np.column_stack([fac[rows, at.F_I], *(fac[rows + n, at.F_J] for n in range(arity - 1))])
 
 
-def mounts_of(fac: I64) -> I64:
+def mount_variables(fac: I64) -> I64:
     """The variables that are mounts of sensors: the last of each factor of three variables."""
     return np.unique(fac[np.flatnonzero(fac[:, at.F_FLAGS] >> at.ROWS_SHIFT) + 1, at.F_J])

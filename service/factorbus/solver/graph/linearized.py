@@ -32,7 +32,7 @@ class Linearized:
         return self.J[:, first : first + int(self.dims[n])]
 
 
-def linearize_factor(graph: FactorGraph, row: int) -> Linearized:
+def linearized_factor(graph: FactorGraph, row: int) -> Linearized:
     """The factor that begins at this row of `fac`."""
     dim, ends = FACTOR_KIND_OF_CODE[int(graph.fac[row, at.F_KIND])].dim, np.array(graph.ends_of(row), np.int64)
     dims = np.array([VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])].dim for v in ends], np.int64)

@@ -7,7 +7,7 @@ import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FactorKind
-from factorbus.solver.graph.linearized import Linearized, linearize_factor
+from factorbus.solver.graph.linearized import Linearized, linearized_factor
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VariableKind
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -39,7 +39,7 @@ def quadratic(graph: FactorGraph, rows: Iterable[int], first: list[int]) -> Quad
     for kind, of in _by_kind(graph, rows):
         if len(kind.connects) > 2:
             for row in of.tolist():
-                _add_many(linearize_factor(graph, row), starts, information, eta, plus)
+                _add_many(linearized_factor(graph, row), starts, information, eta, plus)
             continue
         J, W, r = _evaluated(graph, kind, of)
         there = graph.fac[of, at.F_I : at.F_I + len(kind.connects)]

@@ -13,7 +13,7 @@ from factorbus.solver.kernels.graph.key_table import slot_of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find_outside
-from factorbus.solver.kernels.model.factor_rows import count_rows, row_of_pair
+from factorbus.solver.kernels.model.factor_rows import row_of_pair, rows_of_arity
 from factorbus.solver.kernels.model.kinds import is_camera, is_linear
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import (
@@ -79,7 +79,7 @@ def look_over(groups: I64, graph: Graph) -> int:
         if groups[g, gt.G_FACTORS] == 0:
             variables, numbers = variables + count, numbers + count * size_of(kind)
         else:
-            factors += count * count_rows(arity_of(kind))
+            factors += count * rows_of_arity(arity_of(kind))
             measured += count * (scale_at(kind) + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0))
             if is_camera(kind) and groups[g, gt.G_LIMITED] == 0:
                 return gt.NO_LIMITS
@@ -155,7 +155,7 @@ def append_factors(raw: bytes, group: I64, whole: bool, graph: Graph, scratch: F
         if arity <= 2:
             append_factor(kind, loss, i, j, numbers, graph)
         else:
-            append_rows(kind, loss, ends[:arity], numbers, graph)
+            append_pair_rows(kind, loss, ends[:arity], numbers, graph)
     return -1, gt.GOOD, rest
 
 
@@ -220,9 +220,9 @@ def find_many_ends(kind: int, raw: bytes, keys: int, graph: Graph, ends: I64) ->
 
 
 @part
-def append_rows(kind: int, loss: int, ends: I64, numbers: int, graph: Graph) -> None:
+def append_pair_rows(kind: int, loss: int, ends: I64, numbers: int, graph: Graph) -> None:
     """One more factor of more than two variables: a row for each pair of them (`factor_rows`)."""
-    fac, counts, count = graph.fac, graph.counts, count_rows(ends.size)
+    fac, counts, count = graph.fac, graph.counts, rows_of_arity(ends.size)
     first = counts[at.FACTORS]
     for n in range(ends.size):
         for m in range(n + 1, ends.size):

@@ -103,7 +103,7 @@ def gather_system(v: int, f0: int, f1: int, graph: Graph, linear: _Linear, M: F6
     for f in range(f0, f1):
         if is_one_of_many(f, fac):
             if not is_member(f, fac):
-                chi2 += add_many(v, f, graph, M, z)
+                chi2 += gather_many(v, f, graph, M, z)
             continue
         end = 0 if fac[f, at.F_I] == v else 1
         if fac[f, at.F_I + end] != v:
@@ -125,7 +125,7 @@ def gather_system(v: int, f0: int, f1: int, graph: Graph, linear: _Linear, M: F6
 
 
 @part
-def add_many(v: int, f: int, graph: Graph, M: F64, z: F64) -> float:
+def gather_many(v: int, f: int, graph: Graph, M: F64, z: F64) -> float:
     """The same of one factor of more than two variables, which begins at row f, if variable v is among them."""
     for n in range(count_ends(f, graph.fac)):
         if end_of(f, n, graph.fac) == v:

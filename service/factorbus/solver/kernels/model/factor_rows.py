@@ -60,6 +60,6 @@ def row_of_pair(f: int, a: int, b: int, ends: int) -> int:
 
 
 @inline_kernel
-def count_rows(ends: int) -> int:
+def rows_of_arity(ends: int) -> int:
     """How many rows a factor of so many variables has."""
     return ends * (ends - 1) // 2 if ends > 2 else 1
