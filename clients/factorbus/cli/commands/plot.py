@@ -1,6 +1,7 @@
 """`factorbus plot`: pictures of maps, drives and systems, from files and from the bus."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -74,8 +75,9 @@ def map_command(
     drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict))
     drawn = solved(drawn, on_file=connect is None) if solve else with_values(drawn)
     path = drawn.file("map", out)
-    spread = spread_in(drawn, connect, ellipses, zenoh) if ellipses else None
     estimate = of_the_map(drawn.graph)  # what is on a robot is drawn nowhere
+    placed = replace(drawn, graph=drawn.graph._replace(variables=estimate))
+    spread = spread_in(placed, connect, ellipses, zenoh) if ellipses else None
     truth = aligned_truth(drawn.truth, estimate)
     with output_file(path):
         draw(path, [drawn.unsolved()], estimate, DriveHistory(), drawn.name, drawn.about, truth, spread)
