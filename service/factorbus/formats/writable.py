@@ -75,7 +75,7 @@ def number_text(numbers: Iterable[float]) -> str:
 
 def _writable_factors(group: Factors, gone: I64, form: Form, lost: _Lost) -> Factors | None:
     if group.kind not in form.measured or np.isin(group.keys, gone).any():
-        lost[group.kind, f"{form.name} has no record for such factors"] += len(group.keys)
+        lost[group.kind, _no_record(form)] += len(group.keys)
         return None
     kept = np.ones(len(group.keys), bool)
     if group.kind in ("position_se2", "position_se3"):
@@ -87,6 +87,10 @@ def _writable_factors(group: Factors, gone: I64, form: Form, lost: _Lost) -> Fac
     if not kept.any():
         return None
     return Factors(group.kind, group.keys[kept], group.measured[kept], group.information[kept])
+
+
+def _no_record(form: Form) -> str:
+    return f"{form.name} has no record for such factors"
 
 
 def _without_mounts(batch: Batch, form: Form, lost: _Lost) -> Batch:
@@ -103,7 +107,8 @@ def _without_mounts(batch: Batch, form: Form, lost: _Lost) -> Batch:
             variables.append(group._replace(keys=group.keys[stays], values=values, stamps=stamps))
     for group in batch.factors:
         stays = ~np.isin(group.keys, mounts).any(axis=1)
-        lost[group.kind, why] += int((~stays).sum())
+        known = group.kind in form.measured
+        lost[group.kind, why if known else _no_record(form)] += int((~stays).sum())
         numbers = (None if each is None else each[stays] for each in (group.scale, group.ids))
         if stays.any():
             scale, ids = numbers
