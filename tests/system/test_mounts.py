@@ -1,6 +1,8 @@
 """A robot that does not know where its sensor is, over the bus: the mount is found, asked about, and there again."""
 
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -51,12 +53,26 @@ def noisy(rng: np.random.Generator, at: np.ndarray) -> np.ndarray:
     return at + rng.normal(0, 0.05, 2)
 
 
+def saved_as(path: Path, endpoint: str) -> str:
+    """What `factorbus save` says, which ends well."""
+    command = [sys.executable, "-m", "factorbus.cli", "save", "robot", str(path), "--connect", endpoint]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
 def test_a_mount_is_found_and_asked_about_and_there_after_a_kill(spawn: Callable[..., Process], tmp_path: Path) -> None:
     serve = ("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--journal", str(tmp_path / "journal"))
     service = spawn(*serve)
-    with connect(service.ready()[0], client="robot", timeout_s=60) as bus, bus.map("robot") as robot:
+    endpoint = service.ready()[0]
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("robot") as robot:
         done = drive(robot, 40)
         robot.settle()
+        # The map is of one robot: what is on it has no trajectory, and graph files say that they leave it out.
+        for name in ("way.tum", "map.g2o"):
+            saved = saved_as(tmp_path / name, endpoint)
+            assert ("1 mount left out" in saved) == (name == "map.g2o")
+        assert len((tmp_path / "way.tum").read_text().splitlines()) == 40
         sigma = np.sqrt(np.diag(robot.uncertainty.joint("m0")))
         off = robot.estimate["m0"] - MOUNT
         assert (np.abs(off) < 3 * sigma).all()
