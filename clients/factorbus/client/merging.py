@@ -24,13 +24,14 @@ from factorbus.client.frames import (
     inverse,
     moved_values,
 )
-from factorbus.client.mounts import rows_of_group, split_mounts
+from factorbus.client.mounts import split_mounts
 from factorbus.client.transform_factors import transform_factors
 from factorbus.client.transform_linear import are_relative, says_nothing
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS
 from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, MapGraph, Variables
+from factorbus.proto.mounts import pick_factors
 from factorbus.proto.problems import Problem
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
 
@@ -217,12 +218,12 @@ def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:
     factors, pairs, joint = [], [group for group in batch.factors if group.kind in LINEAR_PAIRS], _joint(batch)
     for group in batch.factors:
         if group.kind in LINEAR:
-            group = rows_of_group(group, ~says_nothing(group, pairs))
+            group = pick_factors(group, ~says_nothing(group, pairs))
         stays = _stays(group, joint)
         if not stays.all():
             held[group.kind] = held.get(group.kind, 0) + int((~stays).sum())
         if stays.any():
-            factors.append(rows_of_group(group, stays))
+            factors.append(pick_factors(group, stays))
     if absolute == "refuse" and not _is_gauge(batch, held):
         raise AbsoluteFactors(held)
     return Batch(tuple(group._replace(fixed=False) for group in batch.variables), tuple(factors)), held

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.mounts import mounts_of
+from factorbus.proto.messages import Batch, Variables
+from factorbus.proto.mounts import mounts_of, pick_factors, pick_variables
 
 
 def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
@@ -21,14 +21,14 @@ def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
         of_mounts = np.isin(group.keys, mounts)
         for half, chosen in ((0, of_mounts), (1, ~of_mounts)):
             if chosen.any():
-                variables[half].append(_some_variables(group, chosen))
+                variables[half].append(pick_variables(group, chosen))
     for group in batch.factors:
         of_mounts = np.asarray(np.isin(group.keys, mounts).all(axis=1))
         if group.kind.startswith("linear_"):
             of_mounts[:] = False
         for half, chosen in ((0, of_mounts), (1, ~of_mounts)):
             if chosen.any():
-                factors[half].append(rows_of_group(group, chosen))
+                factors[half].append(pick_factors(group, chosen))
     first, second = (Batch(tuple(variables[half]), tuple(factors[half])) for half in (0, 1))
     return first, second
 
@@ -36,16 +36,3 @@ def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
 def of_the_map(batch: Batch) -> tuple[Variables, ...]:
     """The variables that are in the frame of the map: all but mounts."""
     return split_mounts(batch)[1].variables
-
-
-def _some_variables(group: Variables, chosen: np.ndarray) -> Variables:
-    values, stamps = (None if each is None else each[chosen] for each in (group.values, group.stamps))
-    return group._replace(keys=group.keys[chosen], values=values, stamps=stamps)
-
-
-def rows_of_group(group: Factors, chosen: np.ndarray) -> Factors:
-    """Some factors of a group."""
-    scale = None if group.scale is None else group.scale[chosen]
-    return group._replace(
-        keys=group.keys[chosen], measured=group.measured[chosen], information=group.information[chosen], scale=scale
-    )

@@ -10,7 +10,7 @@ from factorbus.formats.errors import FormatError
 from factorbus.formats.left_out import LeftOut, shown
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.mounts import mounts_of
+from factorbus.proto.mounts import mounts_of, pick_factors, pick_variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
@@ -102,18 +102,14 @@ def _without_mounts(batch: Batch, form: Form, lost: _Lost) -> Batch:
     for group in batch.variables:
         stays = ~np.isin(group.keys, mounts)
         lost["mounts", why] += int((~stays).sum())
-        values, stamps = (None if each is None else each[stays] for each in (group.values, group.stamps))
         if stays.any():
-            variables.append(group._replace(keys=group.keys[stays], values=values, stamps=stamps))
+            variables.append(pick_variables(group, stays))
     for group in batch.factors:
         stays = ~np.isin(group.keys, mounts).any(axis=1)
         known = group.kind in form.measured
         lost[group.kind, why if known else _no_record(form)] += int((~stays).sum())
-        numbers = (None if each is None else each[stays] for each in (group.scale, group.ids))
         if stays.any():
-            scale, ids = numbers
-            group = group._replace(measured=group.measured[stays], information=group.information[stays])
-            factors.append(group._replace(keys=group.keys[stays], scale=scale, ids=ids))
+            factors.append(pick_factors(group, stays))
     return Batch(tuple(variables), tuple(factors))
 
 

@@ -117,7 +117,7 @@ class TreeSteps:
         return self._tree.memory_bytes()
 
     def rebase(self, rows: int, members: int) -> None:
-        """Note that so many rows of factors that were there after the last step are gone, and members among them."""
+        """Note how many rows of factors are gone since the last step, and how many of them are members."""
         mark = list(self._mark)
         mark[at.FACTORS] -= rows
         mark[at.MEMBERS] -= members

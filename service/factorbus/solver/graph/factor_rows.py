@@ -55,7 +55,7 @@ def of_whole_factors(fac: I64, marked: np.ndarray) -> np.ndarray:
 
 
 def ends_of_rows(fac: I64, rows: I64, arity: int) -> I64:
-    """(m, arity) variables of the factors that begin at these rows, which have so many."""
+    """(m, arity) variables of the factors that begin at these rows, which are of that arity."""
     if arity <= 2:
         return fac[rows, at.F_I : at.F_I + arity]
     return np.column_stack([fac[rows, at.F_I], *(fac[rows + n, at.F_J] for n in range(arity - 1))])
