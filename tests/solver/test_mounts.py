@@ -1,5 +1,6 @@
 """Factors of three variables: sensors whose mount on the robot is estimated, in every mode, with and without losses."""
 
+import gtsam
 import numpy as np
 import pytest
 from naive.dense_covariances import DenseCovariance
@@ -8,6 +9,7 @@ from naive.dense_least_squares import DenseGraph, distance, full
 from naive.random_mounts import MOUNTED, mount_steps, true_mounts
 from naive.solver_parts import keys_in, kinds_in, linearization_points
 
+from factorbus.client import Camera, Draft
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import FactorGroup, Options, Solver, errors
@@ -17,6 +19,9 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.errors import printed
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.linearized import linearized_factor
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 
@@ -306,3 +311,30 @@ def test_whatever_is_fixed_the_estimate_is_the_dense_optimum(held: str, mode: st
         left.put(each.estimate())
         assert each.chi2() == pytest.approx(left.chi2(), rel=1e-9)
         assert left.gauss_newton(iterations=1) < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_camera_at_a_mount_sees_what_gtsams_sees_with_a_sensor_on_the_body(seed: int) -> None:
+    """GTSAM knows mounts that are constant: its pixel, and its Jacobians by pose and point, are those of ours there."""
+    rng, camera = np.random.default_rng(seed), Camera("pinhole", (400.0, 390.0, 320.0, 240.0), width=640, height=480)
+    pose, mount = (boxplus("se3", np.array([0, 0, 0, 0, 0, 0, 1.0]), rng.normal(0, 0.5, 6)) for _ in range(2))
+    ahead = np.array([*rng.uniform(-1, 1, 2), rng.uniform(2, 6), 1.0])
+    point, pixel = (pose_matrix(pose) @ pose_matrix(mount) @ ahead)[:3], rng.uniform(100, 400, 2)
+    draft = Draft().se3("x0", pose).se3("m0", mount).point3("l0", point)
+    draft.point_seen("x0", "l0", camera, pixel, mount="m0", sigmas=(1, 1))
+    graph = FactorGraph()
+    admit(graph, draft.batch())
+    ours = linearized_factor(graph, 0)
+    x, l = gtsam.symbol("x", 0), gtsam.symbol("l", 0)
+    theirs = gtsam.GenericProjectionFactorCal3_S2(
+        pixel, gtsam.noiseModel.Unit.Create(2), x, l, gtsam.Cal3_S2(400, 390, 0, 320, 240),
+        gtsam.Pose3(pose_matrix(mount)),
+    )  # fmt: skip
+    values = gtsam.Values()
+    values.insert(x, gtsam.Pose3(pose_matrix(pose)))
+    values.insert(l, point)
+    J, b = theirs.linearize(values).jacobian()
+    np.testing.assert_allclose(ours.r, -b, atol=1e-9)
+    names = {int(graph.keys[v]): ours.jacobian_of(v) for v in ours.ends.tolist()}
+    np.testing.assert_allclose(names[x][:, [3, 4, 5, 0, 1, 2]], J[:, :6], rtol=1e-9, atol=1e-8)
+    np.testing.assert_allclose(names[l], J[:, 6:], rtol=1e-9, atol=1e-8)

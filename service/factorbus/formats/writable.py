@@ -105,7 +105,7 @@ def _without_mounts(batch: Batch, form: Form, lost: _Lost) -> Batch:
         if stays.any():
             variables.append(pick_variables(group, stays))
     for group in batch.factors:
-        stays = ~np.isin(group.keys, mounts).any(axis=1)
+        stays = np.asarray(~np.isin(group.keys, mounts).any(axis=1))
         known = group.kind in form.measured
         lost[group.kind, why if known else _no_record(form)] += int((~stays).sum())
         if stays.any():
