@@ -62,7 +62,8 @@ class Disk:
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Disk]:
-    mounted = Disk(tmp_path / "disk", 8)
+    # Room for what 1,200 poses take: SQLite's write-ahead log (4 MB), and three checkpoints of 2 MB where two are kept.
+    mounted = Disk(tmp_path / "disk", 32)
     yield mounted
     mounted.release()
 
