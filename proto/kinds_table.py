@@ -5,13 +5,17 @@ python proto/kinds_table.py        a test compares
 
 from pathlib import Path
 
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind
+from factorbus.proto.kinds import FACTOR_KINDS, LINEAR_NAME, VARIABLE_KINDS, FactorKind
 
 README = Path(__file__).with_name("README.md")
 _HEAD = """\
 | factor | connects | measured z | residual r (its order is the order of the information matrix) |
 |---|---|---|---|
 """
+_LINEAR = (
+    f"| `{LINEAR_NAME}` | any x₁, x₂, … | y of each variable, H of each (rows x its scalars, row by row), b (rows) "
+    "| Σ Hₙ (xₙ ⊟ yₙ) + b |\n"
+)
 
 
 def main() -> None:
@@ -21,11 +25,11 @@ def main() -> None:
 
 
 def table() -> str:
-    """A row for each kind."""
-    rows = (
+    """A row for each kind, and one for linear factors."""
+    rows = [
         f"| `{kind.name}` | {_ends(kind)} | {kind.measured} | {kind.residual} |\n" for kind in FACTOR_KINDS.values()
-    )
-    return _HEAD + "".join(rows)
+    ]
+    return _HEAD + "".join(rows) + _LINEAR
 
 
 def found(text: str) -> str:
@@ -36,14 +40,13 @@ def found(text: str) -> str:
 
 def _ends(kind: FactorKind) -> str:
     poses = [VARIABLE_KINDS[end].is_pose for end in kind.connects]
-    letters = ["x₁", "x₂"]
     if kind.base:
         letters = ["a", "b" if all(poses) else "l", "m"]
     elif len(poses) == 1:
         letters = ["x"]
-    elif not kind.name.startswith("linear_") and all(poses):
+    elif all(poses):
         letters = ["a", "b"]
-    elif kind.sees_landmark and not kind.name.startswith("linear_"):
+    else:
         letters = ["a", "y" if kind.connects[1] == "idp" else "l"]
     return ", ".join(f"{end} {letter}" for end, letter in zip(kind.connects, letters, strict=True))
 

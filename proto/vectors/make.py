@@ -20,7 +20,7 @@ import msgpack
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, FactorKind
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind, linear_kind
 from factorbus.proto.messages import (
     Batch,
     Change,
@@ -162,10 +162,10 @@ def _other_kinds() -> Batch:
             Factors("range_between_se3", np.array([[y, y + 1]]), np.array([[3.5]]), unit1),
             Factors("bearing_se2", np.array([[x, l]]), np.array([[-0.25]]), unit1),
             Factors("bearing_se3", np.array([[y, p]]), np.array([[0.0, 3.0, 4.0]]), unit3),
-            Factors("linear_se2", np.array([[x]]), np.array([[*here, *H2, *b2]]), unit3),
-            Factors("linear_se3", np.array([[y]]), np.array([[*turned, *H3, *b3]]), unit6),
-            Factors("linear_pair_se2", np.array([[x, x + 1]]), np.array([[*here, *here, *H2, *H2, *b2]]), unit3),
-            Factors("linear_pair_se3", np.array([[y, y + 1]]), np.array([[*turned, *turned, *H3, *H3, *b3]]), unit6),
+            Factors("linear_3_se2", np.array([[x]]), np.array([[*here, *H2, *b2]]), unit3),
+            Factors("linear_6_se3", np.array([[y]]), np.array([[*turned, *H3, *b3]]), unit6),
+            Factors("linear_3_se2_se2", np.array([[x, x + 1]]), np.array([[*here, *here, *H2, *H2, *b2]]), unit3),
+            Factors("linear_6_se3_se3", np.array([[y, y + 1]]), np.array([[*turned, *turned, *H3, *H3, *b3]]), unit6),
         )
     )
 
@@ -178,31 +178,23 @@ def _one_of(kind: FactorKind) -> Batch:
 
 
 def _linear_kinds() -> Batch:
-    """Linear factors of points and features, and a form in pieces: its number, what is too much, the rest, the pair."""
+    """Linear factors of one variable, of two, and of more, with few rows and with many."""
     plane, space = (symbol("x", 1), symbol("l", 1)), (symbol("y", 1), symbol("p", 1), symbol("f", 1))
-    sent = ("linear_se2", "linear_se3", "linear_pair_se2", "linear_pair_se3")  # in `_other_kinds`
-    names = [name for name in FACTOR_KINDS if name.startswith("linear") and name not in sent]
     of = {"se2": plane[0], "point2": plane[1], "se3": space[0], "point3": space[1], "idp": space[2]}
     groups = []
-    for name in names:
-        kind = FACTOR_KINDS[name]
-        keys = np.array([[of[end] + (e if kind.connects[0] == end else 0) for e, end in enumerate(kind.connects)]])
-        numbers = np.array([(n % 8 - 3) / 4 for n in range(kind.size)])
-        if kind.connects[0] == "se3":
-            numbers[3:7] = 0.0, 0.0, 0.6, 0.8
-        groups.append(Factors(name, keys, numbers[None], np.eye(kind.dim)[np.triu_indices(kind.dim)][None]))
-    two, three = (np.eye(r)[np.triu_indices(r)] for r in (2, 3))
-    here, there = [1.0, 2.0, 0.5], [3.0, 4.0]
-    H2, H3 = np.eye(2).ravel().tolist(), np.eye(3).ravel().tolist()
-    pose = [[*here, *[0.0] * 9, 0.5, 0, 0], [*here, *H3, 0, 0, 0], [*here, *H3, 0.25, 0, 0]]
-    point = [[*there, *H2, 0, 0], [*there, *H2, 0, 0.25]]
-    pair = [*here, *there, 0.5, 0, 0, 0, 0.5, 0, *H2, 0, 0]
-    groups += [
-        Factors("linear_se2", np.full((2, 1), plane[0]), np.array(pose[:2]), np.array([three, -0.5 * three])),
-        Factors("linear_point2", np.full((2, 1), plane[1]), np.array(point), np.array([-two, 2.0 * two])),
-        Factors("linear_se2", np.full((1, 1), plane[0]), np.array(pose[2:]), np.array([three])),
-        Factors("linear_pair_se2_point2", np.array([plane]), np.array([pair]), two[None]),
-    ]
+    for rows, ends in (
+        (2, ("point2",)), (3, ("point3",)), (6, ("idp",)), (2, ("point2", "point2")), (2, ("se2", "point2")),
+        (3, ("se3", "point3")), (6, ("se3", "idp")), (4, ("point3", "idp")), (9, ("se2", "point2", "se2")),
+        (1, ("point3", "se3", "se3", "idp")),
+    ):  # fmt: skip
+        kind = linear_kind(rows, ends)
+        keys = np.array([[of[end] + ends[:n].count(end) for n, end in enumerate(ends)]])
+        numbers, here = np.array([(n % 8 - 3) / 4 for n in range(kind.size)]), 0
+        for end in ends:
+            if end == "se3":
+                numbers[here + 3 : here + 7] = 0.0, 0.0, 0.6, 0.8
+            here += VARIABLE_KINDS[end].size
+        groups.append(Factors(kind.name, keys, numbers[None], np.eye(rows)[np.triu_indices(rows)][None]))
     return Batch(factors=tuple(groups))
 
 

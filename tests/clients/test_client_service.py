@@ -252,9 +252,9 @@ BROUGHT = {
     "numpy": "values and information matrices are its arrays",
     "zenoh": "the bus",
     "msgpack": "messages are its bytes",
-    "factorbus": "client, protocol, and the pieces that linear factors are cut into",
+    "factorbus": "client and protocol",
 }
-OURS = {"factorbus.client", "factorbus.proto", "factorbus.pieces", "factorbus.wording"}
+OURS = {"factorbus.client", "factorbus.proto", "factorbus.wording"}
 TYPES = {"numpy.typing", "numpy._typing._add_docstring"}  # annotations; 0.6 ms
 # Of the standard library: large, and what some other part of the package may want, not this one.
 NOT_WANTED = {

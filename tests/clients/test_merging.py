@@ -8,20 +8,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from naive.dense_factors import boxminus, boxplus, pose_matrix, pose_vector, residual
+from naive.dense_factors import TANGENT, boxminus, boxplus, pose_matrix, pose_vector, residual
 from naive.dense_least_squares import full
 from naive.random_camera_factors import random_camera_factor
 from naive.random_graphs import random_information, random_value
-from naive.random_others import random_other
+from naive.random_others import LINEAR, random_other
 
 from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, KeyCollision, NoAnchor
 from factorbus.client.frames import compose, difference, inverse, moved_values
 from factorbus.client.merging import fit_into
 from factorbus.client.transform_factors import transform_factors
-from factorbus.client.transform_linear import are_relative, says_nothing
-from factorbus.pieces import cut
+from factorbus.client.transform_linear import are_relative
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.linear import LINEAR, LINEAR_PAIRS, parts_of
+from factorbus.proto.linear import parts_of
 from factorbus.proto.messages import Batch, Estimate, Factors, MapGraph, Variables
 from factorbus.proto.problems import BadSymbol
 from factorbus.proto.symbols import parse_symbol
@@ -31,7 +30,10 @@ from factorbus.solver.changing import with_changes
 seeds = st.integers(0, 2**32 - 1)
 ABSOLUTE = ("prior", "position", "heading", "attitude")
 # Mounts are not in the frame of a map: see test_merging_mounts.
-RELATIVE = [n for n, k in FACTOR_KINDS.items() if not (n.startswith(ABSOLUTE) or n in LINEAR or k.base)]
+RELATIVE = [n for n, k in FACTOR_KINDS.items() if not (n.startswith(ABSOLUTE) or k.base)]
+# Of one variable such a factor is absolute.
+JOINING = [name for name in LINEAR if len(FACTOR_KINDS[name].connects) > 1]
+NO_MOUNTS = np.empty(0, np.int64)
 SIGMAS = (0.1, 0.1, 0.05)
 
 
@@ -61,7 +63,7 @@ def random_relative(kind: str, rng: np.random.Generator) -> Any:
 
 
 @given(seed=seeds)
-@pytest.mark.parametrize("kind", RELATIVE)
+@pytest.mark.parametrize("kind", [*RELATIVE, *JOINING])
 def test_a_moved_factor_says_of_moved_values_what_it_said_before(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     ends, z = random_relative(kind, rng)
@@ -69,22 +71,22 @@ def test_a_moved_factor_says_of_moved_values_what_it_said_before(kind: str, seed
     T = random_value("se2" if connects[0].endswith("2") else "se3", rng)
     omega = random_information(FACTOR_KINDS[kind].dim, rng)
     group = Factors(kind, np.arange(len(ends))[None], z[None], omega[None])
-    moved = transform_factors(group, T)
+    moved = transform_factors(group, T, NO_MOUNTS)
     there = [moved_values(of, end[None], T)[0] for of, end in zip(connects, ends, strict=True)]
     before, after = residual(kind, ends, z), residual(kind, there, moved.measured[0])
     expected = before @ full(omega) @ before
-    if kind in LINEAR_PAIRS and "idp" in kind:  # directions turn to first order: see below
+    if kind in JOINING and "idp" in kind:  # directions turn to first order: see below
         return
     np.testing.assert_allclose(after @ full(moved.information[0]) @ after, expected, rtol=1e-7, atol=1e-9)
 
 
 @given(seed=seeds)
-@pytest.mark.parametrize("kind", [kind for kind in LINEAR_PAIRS if "idp" in kind])
+@pytest.mark.parametrize("kind", [kind for kind in JOINING if "idp" in kind])
 def test_a_moved_factor_of_features_says_so_to_first_order(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     ends, z = random_relative(kind, rng)
     connects, T = FACTOR_KINDS[kind].connects, random_value("se3", rng)
-    moved = transform_factors(Factors(kind, np.arange(len(ends))[None], z[None], np.zeros((1, 0))), T)
+    moved = transform_factors(Factors(kind, np.arange(len(ends))[None], z[None], np.zeros((1, 0))), T, NO_MOUNTS)
     y, far = parts_of(kind, z[None]).y, []
     off = [rng.normal(size=6 if of != "point3" else 3) for of in connects]
     for near in (1e-3, 1e-4):
@@ -96,8 +98,8 @@ def test_a_moved_factor_of_features_says_so_to_first_order(kind: str, seed: int)
     assert far[1] < 0.02 * far[0] + 1e-9
 
 
-@pytest.mark.parametrize("kind", LINEAR_PAIRS)
-def test_what_two_variables_say_of_each_other_alone_is_told_from_what_they_say_of_the_map(kind: str) -> None:
+@pytest.mark.parametrize("kind", JOINING)
+def test_what_variables_say_of_each_other_alone_is_distinguished_from_what_they_say_of_the_map(kind: str) -> None:
     """H with rows that a motion of the whole frame leaves alone, by central differences; and such that it does not."""
     rng = np.random.default_rng(3)
     connects = FACTOR_KINDS[kind].connects
@@ -122,8 +124,8 @@ def test_what_two_variables_say_of_each_other_alone_is_told_from_what_they_say_o
         H = rng.normal(size=(rows, len(free))) @ free if relative else rng.normal(size=(rows, sum(widths)))
         blocks = np.split(H, np.cumsum(widths)[:-1], axis=1)
         measured = np.concatenate([*y, *(block.ravel() for block in blocks), np.zeros(rows)])
-        group = Factors(kind, np.array([[1, 2]]), measured[None], np.zeros((1, 0)))
-        assert are_relative(group).tolist() == [relative]
+        group = Factors(kind, np.arange(len(y))[None], measured[None], np.zeros((1, 0)))
+        assert are_relative(group, NO_MOUNTS).tolist() == [relative]
 
 
 def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() -> None:
@@ -143,16 +145,11 @@ def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() 
             solver.step(settle=True)
             changes = Changes().marginalize("x2").listed()
             marginal, *_ = with_changes(solver, changes, Batch(), True)
-            pairs = [f for f in marginal.graph()[1] if f.kind == f"linear_pair_{kind}"]
-            assert len(pairs) == 1
-            pair = Factors(pairs[0].kind, pairs[0].keys, pairs[0].measured, pairs[0].information)
-            assert are_relative(pair).tolist() == [not prior]
-            rest = [
-                Factors(f.kind, f.keys, f.measured, f.information)
-                for f in marginal.graph()[1]
-                if f.kind == f"linear_{kind}"
-            ]
-            assert all(says_nothing(group, [pair]).all() for group in rest) == (not prior)
+            (pair,) = [f for f in marginal.graph()[1] if f.kind.startswith("linear_")]
+            rows = TANGENT[kind]
+            assert pair.kind == f"linear_{2 * rows if prior else rows}_{kind}_{kind}"
+            sent = Factors(pair.kind, pair.keys, pair.measured, pair.information)
+            assert are_relative(sent, NO_MOUNTS).tolist() == [not prior]
 
 
 def draft_pose(kind: str, step: np.ndarray) -> np.ndarray:
@@ -233,7 +230,7 @@ def fixed_point(draft: Draft) -> None:
         ((prior("x0"), prior("x1")), {"prior_se2": 2}),
         ((lambda d: d.position_se2("x0", (0, 0), sigmas=(1, 1)),), {"position_se2": 1}),
         ((lambda d: d.heading_se2("x0", 0.1, sigmas=(1,)),), {"heading_se2": 1}),
-        ((lambda d: d.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), sigmas=SIGMAS),), {"linear_se2": 1}),
+        ((lambda d: d.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), sigmas=SIGMAS),), {"linear_3_se2": 1}),
         ((fixed_point, prior("x0")), {"fixed": 1, "prior_se2": 1}),
         ((fixed_point,), {"fixed": 1}),
     ],
@@ -261,12 +258,12 @@ def test_what_a_map_knows_of_its_own_frame_is_refused_unless_it_is_only_where_it
 
 
 def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
-    """Of its pieces those on pairs may look as if they said nothing of the map's own frame."""
+    """What it says of the map's own frame cannot be taken from it."""
     keys = np.array([parse_symbol(f"x{i}") for i in range(3)])
     Lambda = np.kron(3.01 * np.eye(3) - np.ones((3, 3)), np.diag([100.0, 100.0, 400.0]))
-    pieces = cut(["se2"] * 3, keys, [np.zeros(3)] * 3, Lambda, np.zeros(9))
-    sent = tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in pieces)
-    assert are_relative(sent[-1]).all()
+    H = np.split(np.linalg.cholesky(Lambda).T, 3, axis=1)
+    sent = Draft().linear(["x0", "x1", "x2"], [np.zeros(3)] * 3, H, np.zeros(9), sigmas=[1.0] * 9).batch().factors
+    assert not are_relative(sent[0], NO_MOUNTS).any()
     batch = there().batch
     other = MapGraph(
         9, 4, Batch((*batch.variables, Variables("se2", keys[2:], np.zeros((1, 3)))), (*batch.factors, *sent))

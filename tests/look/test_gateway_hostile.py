@@ -150,7 +150,7 @@ def test_what_is_no_number_is_null_in_a_document() -> None:
 def test_a_piece_of_negative_weight_is_explained() -> None:
     factor = {
         "factor": 1,
-        "kind": "linear_se2",
+        "kind": "linear_3_se2",
         "keys": [7],
         "chi2": -4.0,
         "dims": 3,

@@ -106,8 +106,8 @@ def _absolute(kind: str, x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 def linear_ends(kind: str) -> list[str]:
     """What a linear factor of this name is of."""
-    _, *of = kind.split("_")
-    return of if of[0] != "pair" else of[1:] * (2 if len(of) == 2 else 1)
+    _, _, *of = kind.split("_")
+    return of
 
 
 def boxminus(kind: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -123,7 +123,7 @@ def boxminus(kind: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _linear(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     """Σ H (x ⊟ y) + b."""
     of = linear_ends(kind)
-    rows, sizes = min(TANGENT[end] for end in of), [len(x) for x in ends]
+    rows, sizes = int(kind.split("_")[1]), [len(x) for x in ends]
     *ys, rest = np.split(z, np.cumsum(sizes))
     r = rest[-rows:].copy()
     for end, x, y in zip(of, ends, ys, strict=True):

@@ -1,9 +1,18 @@
 """A factor graph solved with dense matrices: the twin of the solver."""
 
 import numpy as np
-from naive.dense_factors import TANGENT, boxplus, jacobians, residual
+from naive.dense_factors import TANGENT, boxplus, jacobians, linear_ends, residual
 
-CONNECTS = {
+
+class Connects(dict[str, list[str]]):
+    """The kinds of the variables of each kind of factor; a linear one has them in its name."""
+
+    def __missing__(self, kind: str) -> list[str]:
+        assert kind.startswith("linear_"), kind
+        return linear_ends(kind)
+
+
+CONNECTS = Connects({
     "prior_se2": ["se2"],
     "prior_se3": ["se3"],
     "prior_point2": ["point2"],
@@ -26,25 +35,11 @@ CONNECTS = {
     "range_between_se3": ["se3", "se3"],
     "bearing_se2": ["se2", "point2"],
     "bearing_se3": ["se3", "point3"],
-    "linear_se2": ["se2"],
-    "linear_se3": ["se3"],
-    "linear_point2": ["point2"],
-    "linear_point3": ["point3"],
-    "linear_idp": ["idp"],
-    "linear_pair_se2": ["se2", "se2"],
-    "linear_pair_se3": ["se3", "se3"],
-    "linear_pair_point2": ["point2", "point2"],
-    "linear_pair_point3": ["point3", "point3"],
-    "linear_pair_idp": ["idp", "idp"],
-    "linear_pair_se2_point2": ["se2", "point2"],
-    "linear_pair_se3_point3": ["se3", "point3"],
-    "linear_pair_se3_idp": ["se3", "idp"],
-    "linear_pair_point3_idp": ["point3", "idp"],
-}
+})  # fmt: skip
 # Of a sensor whose mount is estimated: the mount last.
 _WITH_MOUNT = ("between_se2", "between_se3", "landmark_se2", "landmark_se3", "bearing_range_se2", "bearing_se2")
 _WITH_MOUNT += ("bearing_se3", "range_se2", "range_se3", "point_seen")
-CONNECTS |= {f"{kind}_mount": [*CONNECTS[kind], CONNECTS[kind][0]] for kind in _WITH_MOUNT}
+CONNECTS.update({f"{kind}_mount": [*CONNECTS[kind], CONNECTS[kind][0]] for kind in _WITH_MOUNT})
 
 
 class DenseGraph:

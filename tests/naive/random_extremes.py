@@ -1,8 +1,10 @@
 """Inserts with numbers from everywhere in what a map admits: the smallest, the largest, and the same place twice."""
 
 import numpy as np
+from naive.dense_factors import linear_ends
 from naive.random_camera_factors import CAMERA_KINDS, measurement
 from naive.random_cameras import CAMERAS
+from naive.random_others import LINEAR
 
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -84,8 +86,7 @@ def connects(kind: str) -> list[str]:
         ends = connects(kind.removesuffix("_mount"))
         return [*ends, ends[0]]
     if kind.startswith("linear"):
-        ends = kind.removeprefix("linear_").removeprefix("pair_").split("_")
-        return ends * 2 if "pair" in kind and len(ends) == 1 else ends
+        return linear_ends(kind)
     if kind.startswith("prior_"):
         return [kind.removeprefix("prior_")]
     if kind.startswith(("position", "heading", "attitude")):
@@ -117,8 +118,10 @@ class Extremes:
         variables = tuple(self._variable(str(kind), fixed=False) for kind in kinds)
         new = {group.kind: int(group.keys[0]) for group in variables}
         factors = [self._factor(f"prior_{kind}", new) for kind in new if kind != "idp" and rng.random() < 0.7]
-        factors += [self._factor("linear_idp", new) for kind in new if kind == "idp" and rng.random() < 0.7]
-        factors += [self._factor(str(kind), new) for kind in rng.choice(list(FACTOR_KINDS), int(rng.integers(0, 4)))]
+        factors += [self._factor("linear_6_idp", new) for kind in new if kind == "idp" and rng.random() < 0.7]
+        factors += [
+            self._factor(str(kind), new) for kind in rng.choice([*FACTOR_KINDS, *LINEAR], int(rng.integers(0, 4)))
+        ]
         return Batch(variables, tuple(factor for factor in factors if factor is not None))
 
     def accept(self, batch: Batch) -> None:

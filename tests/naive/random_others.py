@@ -10,8 +10,18 @@ from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-_BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se", "linear")
-OTHERS = tuple(name for name, kind in FACTOR_KINDS.items() if name.startswith(_BEGINNINGS) and not kind.base)
+_BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se")
+# Of one variable, of two, and of more, with fewer rows than they have scalars, as many, and one more.
+LINEAR = (
+    *("linear_3_se2", "linear_6_se3", "linear_2_point2", "linear_3_point3", "linear_6_idp", "linear_1_se3"),
+    *("linear_3_se2_se2", "linear_6_se3_se3", "linear_2_point2_point2", "linear_3_point3_point3", "linear_6_idp_idp"),
+    *("linear_2_se2_point2", "linear_3_se3_point3", "linear_6_se3_idp", "linear_3_point3_idp", "linear_5_point2_se2"),
+    *("linear_8_se2_se2_point2", "linear_9_se3_point3_idp", "linear_7_point3_se3_se3", "linear_9_se2_point2_se2"),
+)
+OTHERS = (
+    *(name for name, kind in FACTOR_KINDS.items() if name.startswith(_BEGINNINGS) and not kind.base),
+    *LINEAR,
+)
 
 
 def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:
@@ -80,15 +90,17 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
         else:
             factors = [factor("between_se2", [x - 1, x], truth, noise, rng)]
             factors += [factor("between_se3", [y - 1, y], truth, noise, rng)]
-            factors += [made("linear_pair_se2", x - 1, x), made("linear_pair_se3", y, y - 1)]
+            factors += [made("linear_3_se2_se2", x - 1, x), made("linear_6_se3_se3", y, y - 1)]
             factors += [made("range_se2", x, l - 1), made("bearing_se3", y, p - 1)]
-            factors += [made("linear_pair_point2", l, l - 1), made("linear_pair_point3", p - 1, p)]
-            factors += [made("linear_pair_se2_point2", x, l - 1), made("linear_pair_se3_point3", y - 1, p)]
-            factors += [made("linear_pair_idp", f, f - 1), made("linear_pair_se3_idp", y, f - 1)]
-            factors += [made("linear_pair_point3_idp", p - 1, f)]
+            factors += [made("linear_2_point2_point2", l, l - 1), made("linear_3_point3_point3", p - 1, p)]
+            factors += [made("linear_2_se2_point2", x, l - 1), made("linear_3_se3_point3", y - 1, p)]
+            factors += [made("linear_6_idp_idp", f, f - 1), made("linear_6_se3_idp", y, f - 1)]
+            factors += [made("linear_3_point3_idp", p - 1, f)]
             factors += [made("range_between_se2", x, x - 1), made("range_between_se3", y - 1, y)]
+            factors += [made("linear_8_se2_se2_point2", x, x - 1, l), made("linear_9_se3_point3_idp", y - 1, p, f)]
+            factors += [made("linear_7_point3_se3_se3", p - 1, y, y - 1), made("linear_5_point2_se2", l - 1, x)]
         factors += [
-            made("linear_idp", f),
+            made("linear_6_idp", f),
             made("range_se2", x, l),
             made("bearing_se2", x, l),
             made("range_se3", y, p),
@@ -96,7 +108,7 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
         ]
         factors += [factor("prior_point2", [l], truth, noise, rng), factor("prior_point3", [p], truth, noise, rng)]
         if n % 2:
-            factors += [made(kind, x) for kind in ("position_se2", "heading_se2", "linear_se2")]
-            factors += [made("linear_point2", l), made("linear_point3", p)]
-            factors += [made(kind, y) for kind in ("position_se3", "attitude_se3", "linear_se3")]
+            factors += [made(kind, x) for kind in ("position_se2", "heading_se2", "linear_3_se2")]
+            factors += [made("linear_2_point2", l), made("linear_3_point3", p)]
+            factors += [made(kind, y) for kind in ("position_se3", "attitude_se3", "linear_6_se3")]
         yield Batch(tuple(variables), tuple(factors))

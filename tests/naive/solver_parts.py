@@ -70,3 +70,11 @@ def linearization_points(solver: Solver) -> list[np.ndarray]:
     values = tree_of(solver).lin[0] if isinstance(stepper_in(solver), TreeSteps) else graph.values
     rows = graph.var[: solver.variable_count, [at.V_KIND, at.V_AT]].tolist()
     return [values[first : first + VARIABLE_KIND_OF_CODE[code].size].copy() for code, first in rows]
+
+
+def joined_by(solver: Solver) -> list[list[int]]:
+    """The keys of each linear factor of more than two variables, in the order of their ids."""
+    graph = graph_in(solver)
+    fac = graph.fac[: graph.counts[at.FACTORS]]
+    ends = [graph.ends_of(row) for row in np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR).tolist()]
+    return [graph.keys[of].tolist() for of in ends if len(of) > 2]

@@ -121,12 +121,12 @@ def test_what_is_repaired_is_false(dense: DenseGraph) -> None:
     assert rho("geman-mcclure", 3.0, distance) < distance
 
 
-def test_a_form_in_pieces_says_what_it_stands_for() -> None:
-    graph = codec.decode_graph(read("graph_pieces"))
+def test_a_marginal_says_what_it_stands_for() -> None:
+    graph = codec.decode_graph(read("graph_marginal"))
     assert isinstance(graph, MapGraph)
-    pieces = DenseGraph()
-    pieces.add(graph.batch)
-    pieces.put(graph.batch.variables)
-    assert any(kind.startswith("linear") for kind, *_ in pieces.factors)
-    known = DenseCovariance(pieces)
-    check_blocks(asked.decode_covariances(read("covariances_pieces")).groups, known, rtol=1e-6, atol=1e-10)
+    marginal = DenseGraph()
+    marginal.add(graph.batch)
+    marginal.put(graph.batch.variables)
+    assert any(kind.startswith("linear") for kind, *_ in marginal.factors)
+    known = DenseCovariance(marginal)
+    check_blocks(asked.decode_covariances(read("covariances_marginal")).groups, known, rtol=1e-6, atol=1e-10)

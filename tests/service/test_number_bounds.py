@@ -111,7 +111,7 @@ def start(mode: str) -> Map:
 def far(b: float) -> Batch:
     """What puts the point at −b · 10⁵."""
     measured = np.array([[0, 0, 1e-5, 0, 0, 1e-5, b, 0]])
-    return Batch((), (Factors("linear_point2", np.array([[POINT]]), measured, np.array([[1e15, 0, 1e15]])),))
+    return Batch((), (Factors("linear_2_point2", np.array([[POINT]]), measured, np.array([[1e15, 0, 1e15]])),))
 
 
 def near(x: float) -> Batch:

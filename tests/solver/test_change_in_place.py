@@ -24,7 +24,7 @@ from factorbus.solver.divergence import copied
 from factorbus.solver.graph.factor_rows import is_first, losses_of
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.kinds import BOUNDED, LINEAR
+from factorbus.solver.kernels.model.kinds import BOUNDED
 
 WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "robots": lambda seed: random_steps(seed, steps=9),
@@ -107,7 +107,7 @@ def assert_is_said(problem: errors.SolverError, wanted: str) -> None:
 def random_change(solver: Solver, rng: np.random.Generator, weighed: list[Change]) -> list[Change]:
     """One to three changes of factors; `weighed` are those of weights, which may be taken back."""
     fac = graph_in(solver).fac[: row_count(solver)]
-    able = np.flatnonzero(~LINEAR[fac[:, at.F_KIND]] & is_first(fac))
+    able = np.flatnonzero(is_first(fac))
     changes: list[Change] = []
     for _ in range(int(rng.integers(1, 4))):
         rows = rng.choice(able, size=min(int(rng.integers(1, 4)), able.size), replace=False)

@@ -53,7 +53,7 @@ def test_one_factor_holds_a_pose_half_a_turn_off(mode: str, axis: str) -> None:
     prior = Factors("prior_se3", np.array([[X[0]]]), measured, INFO6)
     assert settled([Batch((pose(X[0]),), (prior,))], mode).chi2() < 1e-12
     linear = np.concatenate([measured[0], np.eye(6).ravel(), np.zeros(6)])[None]
-    factor = Factors("linear_se3", np.array([[X[0]]]), linear, INFO6)
+    factor = Factors("linear_6_se3", np.array([[X[0]]]), linear, INFO6)
     assert settled([Batch((pose(X[0]),), (factor,))], mode).chi2() < 1e-12
 
 

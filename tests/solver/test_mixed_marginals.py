@@ -12,16 +12,15 @@ from naive.dense_least_squares import distance
 from naive.random_graphs import camera_steps, random_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
-from naive.solver_parts import graph_in
+from naive.solver_parts import graph_in, joined_by
 
-from factorbus.pieces import MOST
+from factorbus.proto.kinds import MOST_JOINED
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import TreeSensor, city_trees
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
-from factorbus.solver.graph.joints import find_joints
 from factorbus.solver.kernels.model import layout as at
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
@@ -111,13 +110,13 @@ def test_of_a_point_that_is_not_determined_what_is_known_is_kept() -> None:
     solver.step(settle=True)
     after = without(solver, [x])
     kinds = {group.kind for group in after.graph()[1]}
-    assert kinds == {"linear_point2", "range_se2"}
+    assert kinds == {"linear_1_point2", "range_se2"}
     assert_same(solver, after, [x])
 
 
 def test_a_border_is_bounded_and_a_refusal_says_by_what() -> None:
-    """It costs n²/2 factors; a landmark that everything saw is found out before anything is computed."""
-    poses = MOST + 1
+    """It costs n²/2 blocks; a landmark that everything saw is found out before anything is computed."""
+    poses = MOST_JOINED + 1
     keys = np.array([symbol("x", n) for n in range(poses)])
     l = np.array([symbol("l", 0)])
     seen = np.stack([keys, np.repeat(l, poses)], axis=1)
@@ -136,7 +135,7 @@ def test_a_border_is_bounded_and_a_refusal_says_by_what() -> None:
         without(solver, [int(l[0])])
     assert refused.value.detail["separator"] == keys.tolist()
     after = without(solver, [int(l[0]), int(keys[0])])
-    assert len(find_joints(graph_in(after))[0].variables) == MOST
+    assert [len(keys) for keys in joined_by(after)] == [MOST_JOINED]
     assert_same(solver, after, [int(l[0]), int(keys[0])])
 
 
@@ -184,7 +183,7 @@ class Window:
             del self.seen[tree]
         self.solver = with_changes(self.solver, [Change("marginalize", keys=np.array(gone))])[0]
         self.sizes.append(self.solver.memory_bytes())
-        self.widest = max(self.widest, *(len(joint.variables) for joint in find_joints(graph_in(self.solver))), 0)
+        self.widest = max(self.widest, *(len(keys) for keys in joined_by(self.solver)), 0)
 
 
 @pytest.mark.timeout(600)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from naive.dense_least_squares import DenseGraph, distance
-from naive.random_others import OTHERS, other_steps
+from naive.random_others import LINEAR, OTHERS, other_steps
 
+from factorbus.proto import kinds as wire
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
@@ -27,9 +28,11 @@ def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 def test_these_are_the_kinds_that_place_nobody() -> None:
     places = {n for n, model in FACTOR_MODELS.items() if model.initializes or model.lens_at >= 0 or model.base}
-    assert FACTOR_MODELS.keys() - places == set(OTHERS)
+    assert FACTOR_MODELS.keys() - places == set(OTHERS) - set(LINEAR)
     batches = list(other_steps(1))
-    assert {group.kind for batch in batches for group in batch.factors} >= set(OTHERS)
+    there = {group.kind for batch in batches for group in batch.factors}
+    assert there >= set(OTHERS) - set(LINEAR)
+    assert {len(wire.FACTOR_KINDS[kind].connects) for kind in there & set(LINEAR)} == {1, 2, 3}
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -98,7 +101,7 @@ BAD: dict[str, tuple[str, int, float, type[errors.SolverError]]] = {
     "no direction": ("bearing_se3", 3, 0.0, errors.BadDirection),
     "no direction of the map": ("attitude_se3", 3, 0.0, errors.BadDirection),
     "not a number": ("position_se2", 0, np.nan, errors.NotFinite),
-    "no quaternion": ("linear_se3", 3, 5.0, errors.BadQuaternion),
+    "no quaternion": ("linear_6_se3", 3, 5.0, errors.BadQuaternion),
 }
 
 
@@ -122,7 +125,7 @@ def test_a_pose_that_is_joined_to_the_last_one_by_a_linear_factor_is_no_landmark
     graph, keys = FactorGraph(), np.arange(1, 5)
     poses = Variables("se2", keys[:3], np.zeros((3, 3)))
     point = Variables("point2", keys[3:], np.zeros((1, 2)))
-    pair = Factors("linear_pair_se2", keys[[2, 0]][None], np.zeros((1, 27)), _info(3))
+    pair = Factors("linear_3_se2_se2", keys[[2, 0]][None], np.zeros((1, 27)), _info(3))
     seen = Factors("range_se2", keys[[2, 3]][None], np.ones((1, 1)), _info(1))
     admit(graph, Batch((poses, point), (pair, seen)))
     assert constraint(graph).tolist() == [0, 0, 2, 1]

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 ROOTS = ("proto", "service", "clients", "workers")
 # Behind what a part of a file is written that CONTRIBUTING.md names.
 BEHIND = {
-    "FACTOR_KINDS": "FACTOR_KINDS = {\n    kind.name: kind\n    for kind in (\n",
+    "FACTOR_KINDS": "FACTOR_KINDS = FactorKinds(\n    (kind.name, kind)\n    for kind in (\n",
     "FACTOR_MODELS": "FACTOR_MODELS = {\n",
     "the imports": "from factorbus.solver.kernels.model.camera import observation\n",
     "residual": 'Raises KeyError: it has no twin yet."""\n',
@@ -73,7 +73,7 @@ else:
 print("used")
 """
 TURNED = """
-FACTOR_KINDS = dict(reversed(FACTOR_KINDS.items()))
+FACTOR_KINDS = FactorKinds(reversed(FACTOR_KINDS.items()))
 VARIABLE_KINDS = dict(reversed(VARIABLE_KINDS.items()))
 LOSSES = LOSSES[::-1]
 """

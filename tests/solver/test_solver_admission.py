@@ -83,7 +83,7 @@ REFUSED = {
     "information below its bound": ("out_of_bounds", Batch((), (edge(0, 1, info=1e-25 * I3),))),
     "H of a linear factor beyond its bound": (
         "out_of_bounds",
-        Batch((), (Factors("linear_point2", np.array([[100]]), np.array([[0, 0, 1, 0, 0, 1e25, 0, 0]]), I2),)),
+        Batch((), (Factors("linear_2_point2", np.array([[100]]), np.array([[0, 0, 1, 0, 0, 1e25, 0, 0]]), I2),)),
     ),
     "lens beyond its bound": ("out_of_bounds", observation_with(k2=1e300)),
     "indefinite information": ("not_positive_definite", Batch((), (edge(0, 1, info=I3 + np.eye(6)[1:2] * 2),))),

@@ -146,14 +146,11 @@ def test_a_marginal_of_many_poses_is_there_again_after_a_kill(spawn: Callable[..
         joined.settle()
         settled = {name: joined.estimate[name] for name in ("x5", "x8", "x11")}
         done = joined.change(Changes().marginalize("x1", "x2", "x3", "x4"), settle=True)
-        assert done.report["added_factors"] > 3 * 4, "pieces on four poses"
+        assert done.report["added_factors"] == 1
         for name, value in settled.items():
             np.testing.assert_allclose(joined.estimate[name], value, rtol=0, atol=1e-9)
-        pieces = [g for g in joined.graph().batch.factors if g.kind.startswith("linear")]
-        assert any((g.information[:, 0] < 0).any() for g in pieces)
-        with pytest.raises(Refused) as refused:
-            joined.change(Changes().remove_factors([int(pieces[0].ids[0])]))
-        assert refused.value.code == "not_positive_definite"
+        (joining,) = [g for g in joined.graph().batch.factors if g.kind.startswith("linear")]
+        assert joining.keys.shape[1] >= 3
         drive(joined, 12, 14)
         joined.wait_converged()
         before, graph = joined.ask_estimate(), joined.graph()

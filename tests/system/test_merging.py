@@ -238,7 +238,7 @@ def test_losses_marginals_and_asyncio(endpoint: str) -> None:
             graph = await first.graph()
             assert sorted(g.kind for g in graph.batch.factors if g.loss) == ["between_se2"]
             assert sum(g.keys.size // 2 for g in graph.batch.factors if g.loss) == 2
-            assert [g.keys.tolist() for g in graph.batch.factors if g.kind == "linear_pair_se2"] == [[[Y + 2, Y + 4]]]
+            assert [g.keys.tolist() for g in graph.batch.factors if g.kind == "linear_3_se2_se2"] == [[[Y + 2, Y + 4]]]
             T = merged.fitted.frame
             turn = np.array([[np.cos(T[2]), -np.sin(T[2])], [np.sin(T[2]), np.cos(T[2])]])
             return T, {k: after[k - X + Y][:2] - (turn @ row[:2] + T[:2]) for k, row in before.items()}

@@ -87,8 +87,7 @@ class Changes:
         """These variables go; what their factors say of the others is kept, as linear factors.
 
         Refused (too_connected) where what hangs together shares factors with more than 128 variables that stay.  Before
-        any loss, weigh or place of the same insert.  What is kept of more than two variables is one factor in pieces:
-        they stay or go together (else not_positive_definite).
+        any loss, weigh or place of the same insert.
         """
         return self._add(Change("marginalize", keys=_keys(keys)))
 

@@ -24,7 +24,7 @@ from factorbus.client.certainty import (
 )
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.lever_arm import transform_se2, transform_se3
-from factorbus.client.linear import linear_pieces
+from factorbus.client.linear import linear_factor
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -114,7 +114,7 @@ class Draft:
         mount: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
         off the centre moves sideways when the robot turns.  The certainty is that of the sensor, in its frame, and is
         carried over to first order in the error (`factorbus.client.lever_arm`, MATH §3.7).
-        Or the key of an se2 that is estimated: the mount is to be found out (MATH §3.9).
+        Or the key of an se2 that is estimated: the mount is to be found out (MATH §3.8).
         """
         if mount is not None and not isinstance(mount, str | int):
             where = self._joins(first, second, "between_se2")
@@ -230,12 +230,10 @@ class Draft:
         jacobians: H of each, (m, 3) of an se2 or point3, (m, 6) of an se3 or idp, (m, 2) of a point2; residual: b,
         (m,), of any m, and the certainty is of these m.
         kinds: of each; without, three numbers are a point3 where there are others of space, else an se2.
-        What is of more than two variables, or has more rows than the smaller has scalars, is sent as several factors,
-        which sum to it: they stay or go together, and have no loss.
+        More rows than the variables have scalars are sent as the triangle that says the same.
         """
         numbers = key_numbers(keys).tolist()
-        for pieces in linear_pieces(numbers, values, jacobians, residual, kinds, certainty):
-            self._linear.append(pieces)
+        self._linear.append(linear_factor(numbers, values, jacobians, residual, kinds, certainty))
         return self
 
     def idp_first(

@@ -1,4 +1,4 @@
-"""What a front end has linearized itself, as factors that a map takes in: one where it can be, else in pieces."""
+"""What a front end has linearized itself, as a linear factor."""
 
 from __future__ import annotations
 
@@ -9,29 +9,27 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import all_finite, as_numbers, of_type
 from factorbus.client.certainty import Certainty, full, loss_of, triangle_of
-from factorbus.pieces import MOST, as_pieces, tangent_dims
 from factorbus.proto.arrays import F64
-from factorbus.proto.kinds import VARIABLE_KINDS
+from factorbus.proto.kinds import MOST_JOINED, VARIABLE_KINDS, linear_kind
 from factorbus.proto.messages import Factors
-from factorbus.proto.problems import BadInformation, BadLoss, BadShape, UnknownKind
+from factorbus.proto.problems import BadInformation, BadShape, UnknownKind
 from factorbus.proto.symbols import format_symbol
-from factorbus.wording import counted
 
 _SPACE = (6, 7)  # numbers of an idp and of an se3: what is with them and has three is a point3
 _BY_SIZE = {2: "point2", 3: "se2", 6: "idp", 7: "se3"}
 
 
-def linear_pieces(
+def linear_factor(
     keys: Sequence[int],
     values: Sequence[ArrayLike],
     jacobians: Sequence[ArrayLike],
     residual: ArrayLike,
     kinds: Sequence[str] | None,
     certainty: Certainty,
-) -> list[Factors]:
-    """|Σ H (x ⊟ y) + b|² by Ω as factors, in their order; see `Draft.linear`.
+) -> Factors:
+    """|Σ H (x ⊟ y) + b|² by Ω; see `Draft.linear`.
 
-    Raises BadShape, UnknownKind, BadInformation, BadLoss, BadOption, NotFiniteNumbers.
+    Raises BadShape, UnknownKind, BadInformation, BadOption, NotFiniteNumbers.
     """
     where = " ".join(["linear", *map(format_symbol, keys)])
     for name, given in (("values", values), ("jacobians", jacobians), ("kinds", kinds or ())):
@@ -47,20 +45,19 @@ def linear_pieces(
         [_block(f"{where}: jacobian of a {n}", J, (b.size, d)) for n, J, d in zip(names, jacobians, dims, strict=True)]
     )
     triangle, (loss, scale) = triangle_of(where, b.size, certainty), loss_of(where, certainty.get("loss"))
-    if len(keys) <= 2 and b.size <= min(dims):
-        (piece,) = as_pieces(names, np.array(keys), y, H, b)
-        information = _filled(triangle, b.size, min(dims))
-        return [Factors(*piece[:3], information[None], loss, np.array([scale]) if loss else None)]
-    if loss:
-        limit = counted(min(dims), "row") if len(keys) <= 2 else "two variables"
-        raise BadLoss(where, f"the loss {loss!r}", f"none: a linear factor of more than {limit} is sent in pieces")
     root = _root(where, full(triangle, b.size))
-    return [Factors(*piece) for piece in as_pieces(names, np.array(keys), y, root @ H, root @ b)]
+    if b.size > sum(dims) + 1:  # more rows than say anything: a triangle has it all
+        H, b = _triangle(root, H, b)
+        triangle = np.eye(b.size)[np.triu_indices(b.size)]
+    blocks = [block.reshape(-1) for block in np.split(H, np.cumsum(dims)[:-1], axis=1)]
+    measured, ends = np.concatenate([*y, *blocks, b])[None], np.array([keys])
+    kind = linear_kind(b.size, tuple(names)).name
+    return Factors(kind, ends, measured, triangle[None], loss, np.array([scale]) if loss else None)
 
 
 def _check_counts(where: str, keys: Sequence[int], *counts: int) -> None:
-    if not 1 <= len(keys) <= MOST:
-        raise BadShape("linear: keys", len(keys), f"1 to {MOST}")
+    if not 1 <= len(keys) <= MOST_JOINED:
+        raise BadShape("linear: keys", len(keys), f"1 to {MOST_JOINED}")
     if len(set(keys)) < len(keys):
         raise BadShape(f"{where}: keys", "one of them twice", "each once; add up its jacobians")
     for name, count in zip(("values", "jacobians", "kinds"), counts, strict=True):
@@ -76,10 +73,11 @@ def _checked_dims(where: str, names: Sequence[str], y: Sequence[F64]) -> list[in
         if value.shape != (VARIABLE_KINDS[name].size,):
             raise BadShape(f"{where}: value of a {name}", f"shape {value.shape}", f"({VARIABLE_KINDS[name].size},)")
     try:
-        return tangent_dims(names)
+        linear_kind(1, tuple(names))
     except ValueError as problem:
         wanted = "all of the plane (se2, point2), or all of space (se3, point3, idp)"
         raise BadShape(f"{where}: kinds", ", ".join(names), wanted) from problem
+    return [VARIABLE_KINDS[name].dim for name in names]
 
 
 def _kinds_of(where: str, y: Sequence[F64]) -> list[str]:
@@ -99,11 +97,10 @@ def _block(where: str, given: ArrayLike, shape: tuple[int, int]) -> F64:
     return block
 
 
-def _filled(triangle: F64, rows: int, dim: int) -> F64:
-    """The upper triangle of Ω with rows for zeros in H and b, of weight one."""
-    whole = np.eye(dim)
-    whole[:rows, :rows] = full(triangle, rows)
-    return whole[np.triu_indices(dim)]
+def _triangle(root: F64, H: F64, b: F64) -> tuple[F64, F64]:
+    """[H b], of which no row is more than √Ω times the given ones say together: upper triangular, by QR."""
+    R = np.asarray(np.linalg.qr(root @ np.column_stack([H, b]), mode="r"), np.float64)
+    return np.ascontiguousarray(R[:, :-1]), np.ascontiguousarray(R[:, -1])
 
 
 def _root(where: str, information: F64) -> F64:

@@ -26,12 +26,11 @@ from factorbus.client.frames import (
 )
 from factorbus.client.mounts import split_mounts
 from factorbus.client.transform_factors import transform_factors
-from factorbus.client.transform_linear import are_relative, says_nothing
+from factorbus.client.transform_linear import are_relative
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.linear import LINEAR, LINEAR_PAIRS
 from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, MapGraph, Variables
-from factorbus.proto.mounts import pick_factors
+from factorbus.proto.mounts import mounts_of, pick_factors
 from factorbus.proto.problems import Problem
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
 
@@ -128,10 +127,11 @@ def fit_into(
     given = Batch() if anchors is None else batch_of("anchors", anchors)
     size = _size_of(other.batch)
     renamed = _renamed(other.batch, named)
+    mounts = mounts_of(renamed)
     of_robots, renamed = split_mounts(renamed)
     _check_keys(here, _together(of_robots, renamed))
     _check_ends(given, here, _together(of_robots, renamed))
-    kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute)
+    kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute, mounts)
     if absolute == "keep":
         T = np.array([0.0] * size if size == 3 else [0.0] * 6 + [1.0])
         return Fitted(_together(of_robots, _together(kept, given)), T, {}, given.factor_count)
@@ -140,7 +140,7 @@ def fit_into(
         given = _tie(here, renamed, T, sigmas).batch()
     moved = Batch(
         tuple(g._replace(values=moved_values(g.kind, _values(g), T)) for g in kept.variables),
-        tuple(transform_factors(g, T) for g in kept.factors),
+        tuple(transform_factors(g, T, mounts) for g in kept.factors),
     )
     return Fitted(_together(of_robots, _together(moved, given)), T, left_out, given.factor_count)
 
@@ -209,17 +209,15 @@ def _check_ends(anchors: Batch, here: Estimate, renamed: Batch) -> None:
         raise NoAnchor(f"the anchors name {_names(missing)}, which neither this map has nor the other as renamed")
 
 
-def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:
+def _relative(batch: Batch, absolute: str, mounts: I64) -> tuple[Batch, dict[str, int]]:
     """Without what is said of the map's own frame, and how many of each kind that were.  Raises AbsoluteFactors."""
     held: dict[str, int] = {}
     fixed = sum(group.keys.size for group in batch.variables if group.fixed)
     if fixed:
         held["fixed"] = fixed
-    factors, pairs, joint = [], [group for group in batch.factors if group.kind in LINEAR_PAIRS], _joint(batch)
+    factors = []
     for group in batch.factors:
-        if group.kind in LINEAR:
-            group = pick_factors(group, ~says_nothing(group, pairs))
-        stays = _stays(group, joint)
+        stays = are_relative(group, mounts) if FACTOR_KINDS[group.kind].is_linear else _stays(group)
         if not stays.all():
             held[group.kind] = held.get(group.kind, 0) + int((~stays).sum())
         if stays.any():
@@ -229,15 +227,7 @@ def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:
     return Batch(tuple(group._replace(fixed=False) for group in batch.variables), tuple(factors)), held
 
 
-def _joint(batch: Batch) -> I64:
-    """Variables with a linear factor of negative weight: of those, only all linear factors together mean anything."""
-    negative = [g.keys[g.information[:, 0] < 0.0, 0] for g in batch.factors if g.kind in LINEAR]
-    return np.concatenate([np.empty(0, np.int64), *negative])
-
-
-def _stays(group: Factors, joint: I64) -> np.ndarray:
-    if group.kind in LINEAR_PAIRS:
-        return are_relative(group) & ~np.isin(group.keys, joint).all(axis=1)
+def _stays(group: Factors) -> np.ndarray:
     return np.full(len(group.keys), group.kind not in _OF_THE_WORLD)
 
 

@@ -9,10 +9,7 @@ from factorbus.proto.mounts import mounts_of, pick_factors, pick_variables
 
 
 def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
-    """(mounts, and what is known of them alone; all else).
-
-    Linear factors stay together: what one in pieces says of a mount alone is not known without the others.
-    """
+    """(mounts, and what is known of them alone; all else)."""
     mounts = mounts_of(batch)
     if not mounts.size:
         return Batch(), batch
@@ -24,8 +21,6 @@ def split_mounts(batch: Batch) -> tuple[Batch, Batch]:
                 variables[half].append(pick_variables(group, chosen))
     for group in batch.factors:
         of_mounts = np.asarray(np.isin(group.keys, mounts).all(axis=1))
-        if group.kind.startswith("linear_"):
-            of_mounts[:] = False
         for half, chosen in ((0, of_mounts), (1, ~of_mounts)):
             if chosen.any():
                 factors[half].append(pick_factors(group, chosen))

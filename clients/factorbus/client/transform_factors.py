@@ -4,15 +4,15 @@ import numpy as np
 
 from factorbus.client.frames import rotation_of
 from factorbus.client.transform_linear import transform_linear
-from factorbus.proto.arrays import F64
-from factorbus.proto.linear import LINEAR_PAIRS
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Factors
 
 
-def transform_factors(group: Factors, T_a_b: F64) -> Factors:
-    """Relative factors given in b, as they are in a."""
-    if group.kind in LINEAR_PAIRS:
-        return transform_linear(group, T_a_b)
+def transform_factors(group: Factors, T_a_b: F64, mounts: I64) -> Factors:
+    """Relative factors given in b, as they are in a.  mounts: keys of what is on a robot, and does not move."""
+    if FACTOR_KINDS[group.kind].is_linear:
+        return transform_linear(group, T_a_b, mounts)
     return _transform_first(group, T_a_b) if group.kind == "idp_first" else group
 
 

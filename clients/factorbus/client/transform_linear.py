@@ -1,11 +1,9 @@
 """Linear factors of a map that goes into another frame: what they say of where it is, and how they move with it."""
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from factorbus.client.frames import moved_values, rotation_of
-from factorbus.proto.arrays import F64
+from factorbus.proto.arrays import F64, I64
 from factorbus.proto.linear import parts_of
 from factorbus.proto.messages import Factors
 
@@ -13,37 +11,29 @@ from factorbus.proto.messages import Factors
 _ROUNDING = 1e-6
 
 
-def are_relative(group: Factors) -> np.ndarray:
-    """Of each of the linear factors of two variables, whether it says nothing of where the two are together.
+def are_relative(group: Factors, mounts: I64) -> np.ndarray:
+    """Of each of the linear factors of a kind, whether it says nothing of where its variables are together.
 
-    With x_i ⊟ y_i after a small motion ξ of the whole frame being G_i ξ, it says nothing if H₁ G₁ + H₂ G₂ = 0.
+    With x_n ⊟ y_n after a small motion ξ of the whole frame being G_n ξ, it says nothing if Σ H_n G_n = 0.
+    mounts: keys of what is on a robot, and does not move with the frame.
     """
     kinds, y, H, _ = parts_of(group.kind, group.measured)
     said = np.zeros(len(group.keys), bool)
-    for n in range(len(said)):
-        parts = [H[end][n] @ _carried(kinds[end], y[end][n]) for end in (0, 1)]
-        said[n] = np.abs(parts[0] + parts[1]).max() <= _ROUNDING * max(np.abs(parts).max(), 1e-300)
+    for n, on_robots in enumerate(np.isin(group.keys, mounts)):
+        ends = zip(kinds, y, H, on_robots.tolist(), strict=True)
+        parts = [J[n] @ _carried(kind, at[n]) for kind, at, J, is_mount in ends if not is_mount]
+        said[n] = not parts or np.abs(sum(parts)).max() <= _ROUNDING * max(np.abs(parts).max(), 1e-300)
     return said
 
 
-def says_nothing(group: Factors, others: Iterable[Factors]) -> np.ndarray:
-    """Of each of the linear factors of one variable, whether it is the rounding of a marginal that is relative.
+def transform_linear(group: Factors, T_a_b: F64, mounts: I64) -> Factors:
+    """y moves with x.  Of a pose x ⊟ y is local, and the same; of a point it turns with the frame, and H against it.
 
-    Such a one has a factor of two variables, `others`, and what is left of one of them alone: nothing, but for digits.
+    mounts: keys of what is on a robot, whose y stays.
     """
-    told: dict[int, float] = {}
-    for pair in others:
-        for keys, size in zip(pair.keys.tolist(), _largest(pair), strict=True):
-            for key in keys:
-                told[key] = max(told.get(key, 0.0), size)
-    whole = np.array([told.get(key, 0.0) for key in group.keys[:, 0].tolist()])
-    return _largest(group) <= _ROUNDING * whole
-
-
-def transform_linear(group: Factors, T_a_b: F64) -> Factors:
-    """y moves with x.  Of a pose x ⊟ y is local, and the same; of a point it turns with the frame, and H against it."""
-    parts = parts_of(group.kind, group.measured)
-    y = [moved_values(kind, values, T_a_b) for kind, values in zip(parts.kinds, parts.y, strict=True)]
+    parts, y = parts_of(group.kind, group.measured), []
+    for kind, values, keys in zip(parts.kinds, parts.y, group.keys.T, strict=True):
+        y.append(np.where(np.isin(keys, mounts)[:, None], values, moved_values(kind, values, T_a_b)))
     ends = zip(parts.kinds, parts.y, y, parts.H, strict=True)
     H = [_turned(kind, before, after, J, T_a_b) for kind, before, after, J in ends]
     return group._replace(measured=parts._replace(y=y, H=H).measured())
@@ -96,9 +86,3 @@ def _angles(y: F64) -> F64:
     x, _, z = _ray(y)[0]
     flat = x * x + z * z
     return np.array([[z / flat, 0.0, -x / flat], [0.0, -1.0 / np.sqrt(flat), 0.0]])
-
-
-def _largest(group: Factors) -> F64:
-    """Of each linear factor the largest number in its H."""
-    H = parts_of(group.kind, group.measured).H
-    return np.max([np.abs(J).max(axis=(1, 2), initial=0.0) for J in H], axis=0)

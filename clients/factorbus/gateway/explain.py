@@ -55,7 +55,7 @@ def _row(factor: Mapping[str, Any]) -> dict[str, Any]:
         "loss": factor["loss"],
         "weight": factor["weight"],
         "rho": factor["rho"],
-        "misfit": math.sqrt(max(factor["chi2"], 0.0) / factor["dims"]),  # pieces of one factor may have less than 0
+        "misfit": math.sqrt(factor["chi2"] / factor["dims"]),
         "known": factor["influence"] / factor["dims"],
         "without": factor["without"],
     }

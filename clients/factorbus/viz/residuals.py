@@ -9,7 +9,7 @@ import numpy as np
 
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.linear import LINEAR, LINEAR_PAIRS, parts_of
+from factorbus.proto.linear import parts_of
 from factorbus.proto.messages import Factors, Variables
 
 _WIDEST = 7  # numbers of a pose in space
@@ -17,7 +17,8 @@ _WIDEST = 7  # numbers of a pose in space
 
 def chi2_of_factors(group: Factors, values: "Values") -> F64:
     """rᵀ Ω r of each factor of `group` (m,); NaN where a variable has no value or the kind is not one of ours."""
-    residual = _RESIDUALS.get(group.kind)
+    known = FACTOR_KINDS.get(group.kind)
+    residual = _linear(group.kind) if known is not None and known.is_linear else _RESIDUALS.get(group.kind)
     if residual is None or not len(group.keys):
         return np.full(len(group.keys), np.nan)
     r = residual(*(values.rows(column) for column in group.keys.T), group.measured)
@@ -193,7 +194,6 @@ _RESIDUALS: dict[str, Callable[..., F64]] = {
     "range_between_se3": lambda a, b, z: _distance(a, b, z, 3),
     "bearing_se2": lambda a, p, z: _bearing_range(a, p, np.column_stack([z, z]))[:, :1],
     "bearing_se3": lambda a, p, z: _unit(_into_space(a, p)) - _unit(z),
-    **{kind: _linear(kind) for kind in (*LINEAR, *LINEAR_PAIRS)},
 }
 _RESIDUALS |= {
     name: _at_mount(kind.base) for name, kind in FACTOR_KINDS.items() if kind.base and kind.base in _RESIDUALS

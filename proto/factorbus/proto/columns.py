@@ -103,7 +103,7 @@ def _read_variables(index: int, content: Map, strict: bool) -> Variables:
     kind = content.get("kind")
     known = VARIABLE_KINDS.get(kind) if type(kind) is str else None
     if known is None and (strict or type(kind) is not str):
-        raise _kind_problem(place(), content, VARIABLE_KINDS)
+        raise _kind_problem(place(), content, tuple(VARIABLE_KINDS))
     keys = fields.keys(place, content, 0)
     if strict and content.get("values") is None:
         values = None
@@ -122,7 +122,7 @@ def _read_factors(index: int, content: Map) -> Factors:
     kind = content.get("kind")
     known = FACTOR_KINDS.get(kind) if type(kind) is str else None
     if known is None:
-        raise _kind_problem(place(), content, FACTOR_KINDS)
+        raise _kind_problem(place(), content, FACTOR_KINDS.names())
     keys = fields.keys(place, content, len(known.connects))
     measured = fields.rows(place, content, "measured", len(keys), known.size)
     information = fields.rows(place, content, "information", len(keys), known.information_size)
@@ -153,8 +153,8 @@ def _row_size(content: Map, count: int) -> int:
     return len(values) // (8 * count) if count and type(values) is bytes else 0
 
 
-def _kind_problem(where: str, content: Map, known: dict[str, Any]) -> BadMessage:
+def _kind_problem(where: str, content: Map, known: tuple[str, ...]) -> BadMessage:
     kind = content.get("kind")
     if type(kind) is str:
-        return UnknownKind(f"{where}.kind", kind, tuple(known))
+        return UnknownKind(f"{where}.kind", kind, known)
     return BadMessage(f"{where}.kind", "missing" if kind is None else "not a string", f"one of {', '.join(known)}")

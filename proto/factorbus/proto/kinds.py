@@ -4,7 +4,10 @@ The mathematics of each kind (residual, Jacobians, ⊞) is the solver's; this ta
 build and read messages, and a test holds the two against each other.  A name never changes its meaning.
 """
 
+import re
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +60,14 @@ class FactorKind:
         return len(self.connects) == 1
 
     @property
+    def is_linear(self) -> bool:
+        """Whether it is a linear model of its variables."""
+        return self.name.startswith(_LINEAR)
+
+    @property
     def sees_landmark(self) -> bool:
         """Whether it connects a pose with what is no pose."""
-        return [VARIABLE_KINDS[end].is_pose for end in self.connects] == [True, False]
+        return not self.is_linear and [VARIABLE_KINDS[end].is_pose for end in self.connects] == [True, False]
 
 
 _POSE2 = "x y (metres), theta (radians)"
@@ -83,21 +91,68 @@ VARIABLE_KINDS = {
 }
 
 
-def _linear(*ends: str) -> FactorKind:
-    """What is known of one variable, or of two together: of as many rows as the smaller has scalars."""
+# The most variables of a linear factor; it has as many rows as they have scalars, and one more, at most.
+MOST_JOINED = 128
+LINEAR_NAME = "linear_ROWS_KIND_KIND..."
+_LINEAR = "linear_"
+_LINEAR_FORM = re.compile(r"linear_([1-9][0-9]{0,3})((?:_[a-z0-9]+)+)")
+_PLANE = {"se2", "point2"}
+
+
+def linear_kind(rows: int, ends: tuple[str, ...]) -> FactorKind:
+    """The kind of linear factors with these rows and kinds of variables, all of the plane or all of space.
+
+    Raises ValueError: no such kind of variable, kinds of the plane and of space, or too many rows or variables.
+    """
+    if unknown := [end for end in ends if end not in VARIABLE_KINDS]:
+        raise ValueError(f"{unknown[0]!r} is no kind of variable; wanted {', '.join(VARIABLE_KINDS)}")
+    if 0 < sum(end in _PLANE for end in ends) < len(ends):
+        raise ValueError(f"{', '.join(ends)}: wanted all of the plane (se2, point2), or all of space")
     kinds = [VARIABLE_KINDS[end] for end in ends]
-    name = "_".join(["linear", *(ends if len(ends) == 1 else ("pair", *dict.fromkeys(ends)))])
-    rows = min(kind.dim for kind in kinds)
-    values, blocks = sum(kind.size for kind in kinds), [f"{rows} x {kind.dim}" for kind in kinds]
-    size = values + rows * sum(kind.dim for kind in kinds) + rows
+    values, scalars = sum(kind.size for kind in kinds), sum(kind.dim for kind in kinds)
+    if not (1 <= len(ends) <= MOST_JOINED and 1 <= rows <= scalars + 1):
+        raise ValueError(
+            f"{rows} rows on {len(ends)} variables; wanted 1 to {MOST_JOINED} variables, and 1 to {scalars + 1} rows, "
+            "one more than they have scalars"
+        )
+    size = values + rows * scalars + rows
     y = [number for kind in kinds for number in (*[0.0] * (kind.size - 1), 1.0)]
-    example = (*y, *[0.25] * (size - values))
-    if len(ends) == 1:
-        measured = f"y ({values}), H ({blocks[0]}, row by row), b ({rows})"
-        return FactorKind(name, ends, size, rows, measured, "H (x ⊟ y) + b", example)
-    of_both = f"2 x {blocks[0]}" if blocks[0] == blocks[1] else " and ".join(blocks)
-    measured = f"y of both ({values}), H of both ({of_both}), b ({rows})"
-    return FactorKind(name, ends, size, rows, measured, "H₁ (x₁ ⊟ y₁) + H₂ (x₂ ⊟ y₂) + b", example)
+    measured = f"y of each variable ({values}), H of each ({rows} x its scalars, row by row), b ({rows})"
+    name = "_".join(["linear", str(rows), *ends])
+    return FactorKind(name, ends, size, rows, measured, "Σ Hₙ (xₙ ⊟ yₙ) + b", (*y, *[0.25] * (size - values)))
+
+
+@lru_cache(maxsize=1024)
+def _linear_of_name(name: str) -> FactorKind | None:
+    """The linear kind of that name; None: there is none."""
+    if (found := _LINEAR_FORM.fullmatch(name)) is None:
+        return None
+    try:
+        return linear_kind(int(found[1]), tuple(found[2][1:].split("_")))
+    except ValueError:
+        return None
+
+
+class FactorKinds(dict[str, FactorKind]):
+    """The kinds by name.  Those of linear factors, of which there is one for any rows and variables, are found by name
+    as well, and are not among the entries."""
+
+    def __missing__(self, name: str) -> FactorKind:
+        if (kind := _linear_of_name(name)) is None:
+            raise KeyError(name)
+        return kind
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or (isinstance(name, str) and _linear_of_name(name) is not None)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The kind of that name, or `default`."""
+        found = super().get(name)
+        return found or _linear_of_name(name) or default
+
+    def names(self) -> tuple[str, ...]:
+        """For a person: all names, and the form of those of linear factors."""
+        return (*self, LINEAR_NAME)
 
 
 _WITH_MOUNT = (
@@ -113,8 +168,8 @@ def _with_mount(kind: FactorKind) -> FactorKind:
     return replace(kind, name=f"{kind.name}_mount", connects=ends, residual=residual, base=kind.name)
 
 
-FACTOR_KINDS = {
-    kind.name: kind
+FACTOR_KINDS = FactorKinds(
+    (kind.name, kind)
     for kind in (
         FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
         FactorKind(
@@ -252,13 +307,10 @@ FACTOR_KINDS = {
             "u/‖u‖ − z/‖z‖, u = Rₐᵀ (l − tₐ)",
             (2.0, 1.0, 0.5),
         ),
-        *(_linear(kind) for kind in ("se2", "se3", "point2", "point3", "idp")),
-        *(_linear(kind, kind) for kind in ("se2", "se3", "point2", "point3", "idp")),
-        *(_linear(*b) for b in (("se2", "point2"), ("se3", "point3"), ("se3", "idp"), ("point3", "idp"))),
     )
-}
+)
 # And those of a sensor whose mount is estimated: of all that one pose measures of another, or of a point.
-FACTOR_KINDS |= {kind.name: kind for kind in (_with_mount(FACTOR_KINDS[name]) for name in _WITH_MOUNT)}
+FACTOR_KINDS.update((f"{name}_mount", _with_mount(FACTOR_KINDS[name])) for name in _WITH_MOUNT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,12 +8,9 @@ import numpy as np
 from factorbus.proto.arrays import F64
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 
-LINEAR = tuple(name for name in FACTOR_KINDS if name.startswith("linear_") and len(FACTOR_KINDS[name].connects) == 1)
-LINEAR_PAIRS = tuple(name for name in FACTOR_KINDS if name.startswith("linear_pair_"))
-
 
 class Parts(NamedTuple):
-    """Of n linear factors of a kind, for each end: its kind, y (n, size), H (n, rows, d); and b (n, rows)."""
+    """Of n linear factors of a kind, for each variable: its kind, y (n, size), H (n, rows, d); and b (n, rows)."""
 
     kinds: tuple[str, ...]
     y: list[F64]

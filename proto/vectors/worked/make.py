@@ -26,7 +26,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
 
 EPOCH, TIME, BYTES = 7, 0.5, 1 << 20
-MAP, PIECES = "worked", "worked-pieces"
+MAP, MARGINAL = "worked", "worked-marginal"
 X, L = [symbol("x", i) for i in range(4)], [symbol("l", i) for i in (1, 2)]
 POSE, POINT = [100.0, 0, 0, 100, 0, 400], [25.0, 5.0, 36.0]
 
@@ -65,20 +65,20 @@ def _exchange(session: zenoh.Session) -> dict[str, bytes]:
         told[name] = _ask(session, keys.ask_key(MAP, question), message)
     told["admin_maps"] = _ask(session, keys.admin_key("maps"), b"")
     told["admin_stats"] = _ask(session, keys.admin_key("stats"), b"")
-    _ask(session, keys.admin_key("fork"), codec.encode_map({"map": MAP, "as": PIECES}))
-    # A landmark that three poses have seen goes: what it said of them stays, as one linear factor in pieces.
+    _ask(session, keys.admin_key("fork"), codec.encode_map({"map": MAP, "as": MARGINAL}))
+    # A landmark that three poses have seen goes: what it said of them stays, as one linear factor.
     third = Factors("landmark_se2", np.array([[X[3], L[0]]]), np.array([[-0.9, 1.1]]), np.array([POINT]))
     changes = (Change("marginalize", keys=np.array(L[:1])),)
     for sequence, insert in enumerate(
         (Insert(1, Batch(factors=(third,)), True), Insert(2, Batch(), changes=changes)), 1
     ):
         assert insert.sequence == sequence
-        _ask(session, keys.insert_key(PIECES, "robot1"), codec.encode_insert(insert))
-    told["graph_pieces"] = _ask(session, keys.ask_key(PIECES, "graph"), b"")
-    told["covariances_pieces"] = _ask(session, keys.ask_key(PIECES, "covariance"), codec.encode_map({}))
+        _ask(session, keys.insert_key(MARGINAL, "robot1"), codec.encode_insert(insert))
+    told["graph_marginal"] = _ask(session, keys.ask_key(MARGINAL, "graph"), b"")
+    told["covariances_marginal"] = _ask(session, keys.ask_key(MARGINAL, "covariance"), codec.encode_map({}))
     subscriber.undeclare()
     told["delta"], told["delta_more"] = deltas[:2]
-    for name in (PIECES, MAP):
+    for name in (MARGINAL, MAP):
         _ask(session, keys.admin_key("drop"), codec.encode_map({"map": name}))
     return {name: bytes(msgpack.packb(_same(msgpack.unpackb(data))) or b"") for name, data in told.items()}
 

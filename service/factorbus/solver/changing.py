@@ -8,7 +8,6 @@ from factorbus.solver.changes.in_place import try_in_place
 from factorbus.solver.changes.requested import ChangeLike, collect
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.groups import Addition, BatchLike
-from factorbus.solver.graph.joints import check_joints
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
@@ -25,7 +24,6 @@ def with_changes(
     """
     edits = collect(solver._graph, changes)
     made = solver._taken_over(edited(solver._graph, edits))
-    check_joints(made._graph)
     if edits.added:
         admit(made._graph, Addition((), edits.added))
     before = made.variable_count, made.factor_count
@@ -41,9 +39,9 @@ def try_change(
     """Make `changes` of factors, add `batch`, and step, in this solver: it eliminates what they touch, no more.
 
     Gives what `with_changes` gives but for the solver.  None: only that can make them, or say why not; then nothing has
-    changed.  So it is where they remove, fix, free, place or marginalize variables, where linear factors are among
-    them, where something would be free to move, with `settle`, and in modes other than "bayes-tree".  Nothing may be
-    staged.  Raises as `changes.collect` and `stage` do.
+    changed.  So it is where they remove, fix, free, place or marginalize variables, where something would be free to
+    move, with `settle`, and in modes other than "bayes-tree".  Nothing may be staged.  Raises as `changes.collect` and
+    `stage` do.
     """
     if settle:
         return None

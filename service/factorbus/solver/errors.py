@@ -21,7 +21,6 @@
     ├── BadObservation         bad_observation         a pixel of what the camera cannot see
     ├── BadLoss                bad_loss                a loss that does not exist, or a scale that is not positive
     ├── NotPositiveDefinite    not_positive_definite   an information matrix that is not positive definite
-    ├── Apart                  not_positive_definite   a factor in pieces that are not together
     ├── UnknownFactor          unknown_factor          a factor id that the map does not have, or not any more
     ├── NotInMap               unknown_variable        a change of a variable that the map does not have
     ├── InUse                  in_use                  variables to be removed alone that other factors are on
@@ -271,20 +270,6 @@ class NotPositiveDefinite(SolverError):
             where=where,
             seen=f"the eigenvalue {smallest:.3g}",
             wanted="all positive",
-        )
-
-
-class Apart(SolverError):
-    code = "not_positive_definite"
-
-    def __init__(self, keys: Sequence[int], factors: Sequence[int], seen: str) -> None:
-        listed = ", ".join(map(printed, keys[:8])) + (", ..." if len(keys) > 8 else "")
-        super().__init__(
-            f"the linear factors of {listed} are one factor in pieces, some of negative weight: {seen}; "
-            "wanted a sum without negative eigenvalues: leave all of them, or remove or weigh all alike",
-            where=f"linear factors of {listed}",
-            keys=list(keys),
-            factors=list(factors),
         )
 
 

@@ -16,7 +16,6 @@ from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.columns import Columns
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import BatchLike, FactorGroup, Group
-from factorbus.solver.graph.joints import find_apart
 from factorbus.solver.inc_l.steps import STATE_TYPES, IncrementalSteps
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
@@ -126,14 +125,13 @@ class Solver:
         return self._graph.columns_bytes()
 
     def graph(self, variables: int | None = None, factors: int | None = None) -> tuple[list[Group], list[FactorGroup]]:
-        """A copy of everything: variables with their present values, and factors by kind in the order of their ids;
-        but those that are one factor in pieces behind the others, in their order.
+        """A copy of everything: variables with their present values, and factors by kind in the order of their ids.
 
         variables, factors: how many of each at most, the first ones.
         """
         count = self.variable_count if variables is None else min(variables, self.variable_count)
         rows = None if factors is None else self._graph.rows_of_first(factors)
-        return self._graph.variables(np.arange(count)), self._graph.factors(rows, find_apart(self._graph))
+        return self._graph.variables(np.arange(count)), self._graph.factors(rows)
 
     def content(self) -> FactorGraph:
         """A copy of everything, as of the last step, for computations elsewhere."""

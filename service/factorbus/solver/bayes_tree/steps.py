@@ -171,7 +171,7 @@ class TreeSteps:
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step, summed anew."""
-        return max(self._sum_chi2(self._mark[at.FACTORS]), 0.0)  # pieces of a form sum to zero but for rounding
+        return self._sum_chi2(self._mark[at.FACTORS])
 
     def _check_determined(self) -> str:
         """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
@@ -283,7 +283,7 @@ class TreeSteps:
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
         _, chi2, _, error, allowed, chi2_before = self._tree.totals[: tl.T_BEFORE + 1].tolist()
-        chi2 = max(chi2, 0.0)  # pieces of a form sum to zero but for rounding
+        chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
         share = self._options.converged_share
         converged = result.converged if result else error <= allowed
         if not result and self._tree.raised:

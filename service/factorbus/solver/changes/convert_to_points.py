@@ -9,14 +9,12 @@ import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph, table_size
-from factorbus.solver.graph.factor_rows import losses_of
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.graph.factor_rows import losses_of, rows_of_factors
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.key_table import enter_keys
 from factorbus.solver.kernels.graph.linearity_index import linearity
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.kinds import LINEAR
 from factorbus.solver.lenses.layout import LENS_SIZE
 
 _TURNING = "turning features into points"
@@ -61,7 +59,8 @@ def pick_features(graph: FactorGraph, keys: I64) -> I64:
 def has_linear_factor(graph: FactorGraph) -> np.ndarray:
     """Which variables (n,) a linear factor is on: a feature that has one stays what that is of."""
     fac, marked = graph.fac[: graph.counts[at.FACTORS]], np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
-    marked[fac[LINEAR[fac[:, at.F_KIND]], at.F_I : at.F_J + 1]] = True
+    linear = np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR)
+    marked[fac[rows_of_factors(fac, linear), at.F_I : at.F_J + 1]] = True
     return marked[:-1]
 
 
@@ -114,15 +113,15 @@ def _point(y: F64) -> F64:
 def _payload(graph: FactorGraph, fac: I64, turned: I64) -> F64:
     """The payloads, packed anew; F_KIND and F_AT of `fac` follow."""
     pieces, at_new = [], 0
-    for row in fac:
+    for f, row in enumerate(fac):
         if row[at.F_KIND] == at.MEMBER:
             continue
-        kind, p = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])], int(row[at.F_AT])
+        kind, p = graph.kind_of(f), int(row[at.F_AT])
         has_loss = losses_of(row) != at.NO_LOSS
-        numbers = graph.payload[p : p + kind.size + kind.triangle + has_loss]
+        numbers = graph.payload[p : p + kind.width + has_loss]
         if row[at.F_J] >= 0 and turned[row[at.F_J]]:
             if kind.code == at.IDP_FIRST:
-                scale = numbers[kind.size + kind.triangle :]
+                scale = numbers[kind.width :]
                 numbers = np.concatenate([numbers[:2], numbers[_LENS], numbers[kind.size + _PIXEL_BLOCK], scale])
             row[at.F_KIND] = at.POINT_SEEN
         pieces.append(numbers)

@@ -8,7 +8,6 @@ import numpy as np
 from factorbus.solver.changes.requested import Edits
 from factorbus.solver.graph.factor_graph import FactorGraph, table_size
 from factorbus.solver.graph.factor_rows import is_first, with_losses
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.key_table import enter_keys
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -16,9 +15,6 @@ from factorbus.solver.kernels.model import layout as at
 
 _SIZE = np.array([VARIABLE_KIND_OF_CODE[code].size for code in sorted(VARIABLE_KIND_OF_CODE)], np.int64)
 _DIM = np.array([VARIABLE_KIND_OF_CODE[code].dim for code in sorted(VARIABLE_KIND_OF_CODE)], np.int64)
-# The last is of rows that are not the first of their factors, which have none.
-_MEASURED = np.array([*(FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)), 0], np.int64)
-_TRIANGLE = np.array([*(FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)), 0], np.int64)
 
 
 def edited(graph: FactorGraph, edits: Edits) -> FactorGraph:
@@ -29,7 +25,7 @@ def edited(graph: FactorGraph, edits: Edits) -> FactorGraph:
     made.stamps = graph.stamps[stays]
     _pack_values(edits.values, made)
     columns = _number_columns(made, edits.free[stays])
-    _pack_payload(graph, made, edits.loss[kept], edits.scale[kept], edits.weight[kept])
+    _pack_payload(graph, made, kept, edits)
     _renumber_ends(made, edits)
     made.table = np.zeros(max(table_size(max(stays.size, 1)), 64), np.int64)
     enter_keys(stays.size, made.table, made.keys)
@@ -62,10 +58,10 @@ def _number_columns(made: FactorGraph, free: np.ndarray) -> int:
     return columns
 
 
-def _pack_payload(graph: FactorGraph, made: FactorGraph, loss: I64, scale: F64, weight: F64) -> None:
-    """Measurements, information matrices times `weight`, and scales; F_AT and F_FLAGS follow."""
-    fac = made.fac
-    measured, triangle = _MEASURED[fac[:, at.F_KIND]], _TRIANGLE[fac[:, at.F_KIND]]
+def _pack_payload(graph: FactorGraph, made: FactorGraph, kept: I64, edits: Edits) -> None:
+    """Measurements, information times its weight, and scales, of the rows `kept`; F_AT and F_FLAGS follow."""
+    fac, loss, scale, weight = made.fac, edits.loss[kept], edits.scale[kept], edits.weight[kept]
+    measured, triangle = graph.sizes_of(kept)
     sizes, robust = measured + triangle, np.flatnonzero(loss != at.NO_LOSS)
     start = _starts(sizes + (loss != at.NO_LOSS))
     made.payload = np.empty(int(sizes.sum()) + robust.size)

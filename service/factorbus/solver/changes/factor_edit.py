@@ -17,7 +17,6 @@ from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.changes.requested import Edits
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, losses_of, with_losses
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.edit_factors import LOG_WIDTH, MOST_LINKS, edit_factors, relink
@@ -25,7 +24,6 @@ from factorbus.solver.kernels.bayes_tree.hessian import hessian_size
 from factorbus.solver.kernels.bayes_tree.remove_rows import close_gaps, open_gaps
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.kinds import LINEAR
 from factorbus.solver.sparse.anchors import find_undetermined
 
 # What nobody has any more of the payload or of the Hessians, as a share of all: with more everything is packed anew.
@@ -78,8 +76,6 @@ class FactorEdit:
         """Whether nothing else is changed, and a step can do it."""
         graph, state, counted = self._graph, self._tree.state, self._edits.counted
         if any(counted[each] for each in _OTHERS) or not self._rows.size or state[tl.S_RAISED]:
-            return False
-        if LINEAR[graph.fac[self._rows, at.F_KIND]].any():  # pieces of negative weight among them
             return False
         hollow = state[tl.S_HOLES] > _MOST_HOLES * state[tl.S_HESSIAN]
         if hollow or graph.holes > _MOST_HOLES * graph.counts[at.PAYLOAD]:
@@ -178,7 +174,7 @@ class FactorEdit:
     def _rewrite(self, row: int) -> None:
         """The weight and loss of a factor that stays."""
         graph, edits = self._graph, self._edits
-        kind, start = FACTOR_KIND_OF_CODE[int(graph.fac[row, at.F_KIND])], int(graph.fac[row, at.F_AT])
+        kind, start = graph.kind_of(row), int(graph.fac[row, at.F_AT])
         loss = int(edits.loss[row])
         had, width = bool(losses_of(graph.fac[row]) != at.NO_LOSS), kind.size + kind.triangle
         if loss != at.NO_LOSS and not had:
@@ -199,9 +195,7 @@ class FactorEdit:
 
     def _widths(self, rows: I64) -> I64:
         """How many numbers of the payload each of these factors has."""
-        kinds = [FACTOR_KIND_OF_CODE.get(code) for code in self._graph.fac[rows, at.F_KIND].tolist()]
-        robust = losses_of(self._graph.fac[rows]) != at.NO_LOSS
-        return np.array([kind.size + kind.triangle if kind else 0 for kind in kinds], np.int64) + robust
+        return sum(self._graph.sizes_of(rows)) + (losses_of(self._graph.fac[rows]) != at.NO_LOSS)
 
 
 def _pair(graph: FactorGraph, row: int) -> list[int]:

@@ -1,18 +1,17 @@
 """Variables taken out of a graph for good: what their factors say of the others is kept as linear factors.  MATH §11.3.
 
 Variables that hang together go together.  Those that they share a factor with are their separator, and what they say of
-it is a linear factor there, linearized at the estimate: of one variable or two, or a prior of one point that it
-determines.  Of more variables it is one in pieces (`joints`).  Refused is a separator of more than MOST variables.
+it is one linear factor there, linearized at the estimate; or a prior, of a single point that it determines.  Refused is
+a separator of more than MOST_JOINED variables.
 """
 
 import numpy as np
 
-from factorbus.pieces import MOST, as_pieces, cut
+from factorbus.proto.kinds import MOST_JOINED, linear_kind
 from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, of_whole_factors
 from factorbus.solver.graph.groups import FactorGroup
-from factorbus.solver.graph.joints import find_joints
 from factorbus.solver.graph.quadratic import Quadratic, kind_of, quadratic
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -29,7 +28,7 @@ def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[Fac
     """
     made: list[FactorGroup] = []
     used: list[int] = []
-    for part, rows in _pieces(graph, gone, kept):
+    for part, rows in _components(graph, gone, kept):
         used += rows
         _check_separator(graph, part or gone[:1].tolist(), rows, gone)
         whole = quadratic(graph, rows, part)
@@ -39,11 +38,8 @@ def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[Fac
     return made, used
 
 
-def _pieces(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[list[int], list[int]]]:
-    """(free variables, factors) of each piece of `gone` that hangs together; what is fixed joins nothing.
-
-    What is known of many variables together goes whole where one of them goes.
-    """
+def _components(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[list[int], list[int]]]:
+    """(free variables, factors) of each part of `gone` that hangs together; what is fixed joins nothing."""
     going = set(gone.tolist())
     free = {v for v in going if graph.var[v, at.V_COLUMN] >= 0}
     above = {v: v for v in free}
@@ -55,13 +51,9 @@ def _pieces(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[list[
         return v
 
     fac = graph.fac[: kept.size]
-    groups = [
-        (joint.variables, joint.rows) for joint in find_joints(graph, kept) if not going.isdisjoint(joint.variables)
-    ]
-    joined = {f for _, rows in groups for f in rows}
     on = of_whole_factors(fac, kept & np.isin(fac[:, at.F_I : at.F_J + 1], gone).any(axis=1)) & is_first(fac)
-    groups += [(graph.ends_of(f), [f]) for f in np.flatnonzero(on).tolist() if f not in joined]
-    for of, _ in groups:
+    factors_there = [(graph.ends_of(f), f) for f in np.flatnonzero(on).tolist()]
+    for of, _ in factors_there:
         inside = [v for v in of if v in free]
         for v in inside[1:]:
             above[root(v)] = root(inside[0])
@@ -69,10 +61,10 @@ def _pieces(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[list[
     factors: dict[int, list[int]] = {}
     for v in sorted(free):
         variables.setdefault(root(v), []).append(v)
-    for of, rows in groups:
+    for of, f in factors_there:
         inside = [v for v in of if v in free]
         head = root(inside[0]) if inside else max(set(of) - going, default=-1)
-        factors.setdefault(head, []).extend(rows)
+        factors.setdefault(head, []).append(f)
     heads = sorted({*variables, *factors})
     return [(variables.get(head, []), sorted(factors.get(head, []))) for head in heads]
 
@@ -81,8 +73,8 @@ def _check_separator(graph: FactorGraph, part: list[int], rows: list[int], gone:
     """Before anything is computed of it.  Raises TooConnected."""
     ends = np.setdiff1d([v for row in rows for v in graph.ends_of(row)], gone).astype(np.int64)
     separator = ends[graph.var[ends, at.V_COLUMN] >= 0]
-    if separator.size > MOST:
-        raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[separator].tolist(), MOST)
+    if separator.size > MOST_JOINED:
+        raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[separator].tolist(), MOST_JOINED)
 
 
 def _reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64]:
@@ -107,20 +99,18 @@ def _reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64
 
 
 def _as_factors(graph: FactorGraph, separator: list[int], information: F64, eta: F64) -> list[FactorGroup]:
-    """Linear factors on the separator with these Λ and η."""
-    kinds, keys, y = (
-        [kind_of(graph, v).name for v in separator],
-        graph.keys[separator],
-        [_value(graph, v) for v in separator],
-    )
-    if len(separator) > 2:
-        pieces = cut(kinds, keys, y, information, eta)
-    elif len(separator) == 1 and kinds[0] in ("point2", "point3") and _is_determined(information):
+    """A factor on the separator with these Λ and η; none where they say nothing."""
+    kinds, keys = [kind_of(graph, v).name for v in separator], graph.keys[separator]
+    y = [_value(graph, v) for v in separator]
+    if len(separator) == 1 and kinds[0] in ("point2", "point3") and _is_determined(information):
         return [_prior(kinds[0], keys, y[0], information, eta)]
-    else:
-        R, d = _root(information, eta)
-        pieces = as_pieces(kinds, keys, y, R, -d)
-    return [FactorGroup(*piece) for piece in pieces]
+    R, d = _root(information, eta)
+    if not len(R):
+        return []
+    dims = np.cumsum([kind_of(graph, v).dim for v in separator])
+    H = [block.reshape(-1) for block in np.split(R, dims[:-1], axis=1)]
+    of, upper = linear_kind(len(R), tuple(kinds)), np.eye(len(R))[np.triu_indices(len(R))]
+    return [FactorGroup(of.name, keys[None], np.concatenate([*y, *H, -d])[None], upper[None])]
 
 
 def _is_determined(information: F64) -> bool:
@@ -135,12 +125,16 @@ def _prior(kind: str, keys: I64, y: F64, information: F64, eta: F64) -> FactorGr
 
 
 def _root(information: F64, eta: F64) -> tuple[F64, F64]:
-    """Upper triangular R and d with RᵀR = Λ and Rᵀd = η; rows of nothing where Λ has no information."""
-    values, V = np.linalg.eigh(information)
+    """R (rank, n), upper triangular, and d with RᵀR = Λ and Rᵀd = η."""
+    # Without units: what is known of an angle and of a place differ by as much as their scales.
+    D = np.sqrt(np.maximum(information.diagonal(), 0.0))
+    inverse = np.where(D > 0.0, 1.0 / np.where(D > 0.0, D, 1.0), 0.0)
+    S = information * inverse * inverse[:, None]
+    values, V = np.linalg.eigh(0.5 * (S + S.T))
     known = values > _NOTHING * max(values[-1], 0.0)
-    root = np.where(known, np.sqrt(np.maximum(values, 0.0)), 0.0)
-    along = np.where(known, (V.T @ eta) / np.where(known, root, 1.0), 0.0)
-    Q, R = np.linalg.qr(root[:, None] * V.T)
+    root = np.sqrt(values[known])
+    along = (V[:, known].T @ (inverse * eta)) / root
+    Q, R = np.linalg.qr(root[:, None] * V[:, known].T * D)
     return np.triu(R), Q.T @ along
 
 

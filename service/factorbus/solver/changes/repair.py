@@ -22,9 +22,7 @@ from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, rows_of_factors
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.groups import Group
-from factorbus.solver.graph.joints import find_joints
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -91,9 +89,8 @@ def repair(graph: FactorGraph, factors: I64 | None = None, probability: float = 
 def find_loops(graph: FactorGraph) -> I64:
     """Rows of the factors between variables that factors before them, or being fixed, join already.
 
-    Pieces of what is known of many variables together join, and are no suspects.
+    Linear factors of more than two variables, which marginals are, join, and are no suspects.
     """
-    trusted = {f for joint in find_joints(graph) for f in joint.rows}
     count = int(graph.counts[at.VARIABLES])
     above = list(range(count + 1))
     for v in np.flatnonzero(graph.var[:count, at.V_COLUMN] < 0).tolist():
@@ -104,13 +101,19 @@ def find_loops(graph: FactorGraph) -> I64:
         i, j = fac[f, at.F_I : at.F_J + 1].tolist()
         if j < 0:
             continue
-        first, second = _root(above, i), _root(above, j)
-        if first == second:
-            if f not in trusted:
-                loops.append(f)
-        else:
-            above[min(first, second)] = max(first, second)
+        if fac[f, at.F_KIND] == at.LINEAR and len(ends := graph.ends_of(f)) > 2:
+            for v in ends[1:]:
+                _join(above, ends[0], v)
+        elif not _join(above, i, j):
+            loops.append(f)
     return np.array(loops, np.int64)
+
+
+def _join(above: list[int], i: int, j: int) -> bool:
+    """Join two variables; False: they are."""
+    first, second = _root(above, i), _root(above, j)
+    above[min(first, second)] = max(first, second)
+    return first != second
 
 
 def _root(above: list[int], v: int) -> int:
@@ -125,11 +128,6 @@ def _rows(graph: FactorGraph, ids: I64) -> I64:
     rows = graph.rows_of(ids)
     if (missing := np.flatnonzero(rows < 0)).size:
         raise errors.UnknownFactor(int(ids[missing[0]]), graph.next_id)
-    pieces = {f for joint in find_joints(graph) for f in joint.rows}
-    if bad := [f for f in rows.tolist() if f in pieces]:
-        named = int(graph.ids_of(np.array(bad[:1]))[0])
-        seen = f"{named}, a piece of what is known of many variables together"
-        raise errors.BadOption("factors", seen, "other factors")
     return rows
 
 
@@ -153,10 +151,10 @@ class _Problem:
         edits.loss[rows] = at.NO_LOSS
         self.graph, self.rows = edited(graph, edits), rows
         self._as_given = self.graph.payload.copy()
-        kinds = [FACTOR_KIND_OF_CODE[code] for code in self.graph.fac[rows, at.F_KIND].tolist()]
-        self.bound = threshold(np.array([kind.dim for kind in kinds], np.int64), probability)
-        starts = self.graph.fac[rows, at.F_AT] + np.array([kind.size for kind in kinds], np.int64)
-        sizes = np.array([kind.triangle for kind in kinds], np.int64)
+        dims = np.array([self.graph.kind_of(row).dim for row in rows.tolist()], np.int64)
+        self.bound = threshold(dims, probability)
+        measured, sizes = self.graph.sizes_of(rows)
+        starts = self.graph.fac[rows, at.F_AT] + measured
         along = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
         self._places, self._sizes = np.repeat(starts, sizes) + along, sizes
         options = Options(mode="all-batch")

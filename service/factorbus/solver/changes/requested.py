@@ -28,9 +28,8 @@ from factorbus.solver.changes.marginal import marginals
 from factorbus.solver.graph.admission import out_of_bounds
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, losses_of, of_whole_factors, rows_of_factors
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSSES
+from factorbus.solver.graph.factors import LOSSES
 from factorbus.solver.graph.groups import FactorGroup
-from factorbus.solver.graph.joints import check_kept
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -40,8 +39,6 @@ CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free",
 # A marginal is of the graph as it is: of what came before in the insert, it sees what is removed and nothing else.
 _BEFORE_MARGINALIZE = {"remove_factors", "remove_variables"}
 _NONE = np.empty(0, np.int64)
-# Numbers of a measurement and its information, by the code of the kind.
-_WIDTH = np.array([*(k.size + k.triangle for _, k in sorted(FACTOR_KIND_OF_CODE.items())), 0], np.int64)
 _QUATERNION_TOLERANCE = 1e-3
 _WEIGHTS = (1e-12, 1e12)  # beyond, a factor holds nothing, or nothing else does
 
@@ -102,7 +99,7 @@ def collect(graph: FactorGraph, changes: Sequence[ChangeLike]) -> Edits:
     """`changes` in their order.
 
     Raises UnknownKind, UnknownFactor, NotInMap, NamedTwice, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
-    NotFinite, OutOfBounds, BadQuaternion, Apart, TooConnected, Underconstrained, BadOrder.
+    NotFinite, OutOfBounds, BadQuaternion, TooConnected, Underconstrained, BadOrder.
     """
     edits = unchanged(graph)
     before = edits.free.copy()
@@ -114,7 +111,6 @@ def collect(graph: FactorGraph, changes: Sequence[ChangeLike]) -> Edits:
         edits.made.add(change.change)
     if edits.carry:
         edits.values = carry_along(graph, edits.values, edits.placed, edits.stays, edits.kept)
-    check_kept(graph, edits.kept & (edits.loss == at.NO_LOSS))  # what gets a loss leaves the others as well
     first = is_first(graph.fac[: edits.kept.size])
     edits.counted = {
         "removed_variables": int(np.count_nonzero(~edits.stays)),
@@ -135,7 +131,7 @@ def unchanged(graph: FactorGraph) -> Edits:
     loss = losses_of(fac)
     scale = np.zeros(factors)
     robust = np.flatnonzero(loss != at.NO_LOSS)
-    scale[robust] = graph.payload[fac[robust, at.F_AT] + _WIDTH[fac[robust, at.F_KIND]]]
+    scale[robust] = graph.payload[fac[robust, at.F_AT] + sum(graph.sizes_of(robust))]
     return Edits(
         np.ones(variables, bool),
         var[:, at.V_COLUMN] >= 0,
@@ -195,9 +191,7 @@ def _weigh(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
 
 def _check_weighed(graph: FactorGraph, edits: Edits, rows: I64) -> None:
     """Is Ω of these factors still within its bounds?  Raises BadWeight."""
-    fac = graph.fac[rows]
-    for code in np.unique(fac[:, at.F_KIND]).tolist():
-        kind, of = FACTOR_KIND_OF_CODE[code], rows[fac[:, at.F_KIND] == code]
+    for kind, of in graph.kinds_of(rows):
         omega = np.abs(graph.payload[graph.fac[of, at.F_AT, None] + kind.size + np.arange(kind.triangle)])
         diagonal = omega[:, np.cumsum([0, *range(kind.dim, 1, -1)])]
         least, most = LEAST_INFORMATION / diagonal.min(axis=1), MOST_INFORMATION / omega.max(axis=1)
@@ -252,7 +246,6 @@ def _marginalize(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     gone = np.unique(_variables(graph, edits, change))
     if not edits.made <= _BEFORE_MARGINALIZE:
         raise errors.BadOrder("marginalize", "before any loss, weigh, fix, free, place or marginalize")
-    check_kept(graph, edits.kept, all_or_none=True)
     made, replaced = marginals(graph, gone, edits.kept)
     edits.added += made
     edits.stays[gone] = False

@@ -12,7 +12,7 @@ from factorbus.solver.covariance.kernels.innovation import distances_and_gains, 
 from factorbus.solver.covariance.square_root import LARGEST
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factor_rows import is_first
+from factorbus.solver.graph.factor_rows import are_of_many, is_first
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.groups import FactorsLike
 from factorbus.solver.graph.linearized import linearized_factor
@@ -68,7 +68,7 @@ def admitted(graph: FactorGraph, groups: Sequence[FactorsLike]) -> Iterator[None
     """`groups` are the last factors of `graph` for a while.  Raises as `evaluate_candidates`."""
     mark = graph.mark()
     try:
-        admit(graph, _Batch((), tuple(groups)), whole=False)
+        admit(graph, _Batch((), tuple(groups)))
         yield
     finally:
         graph.forget(mark)
@@ -78,10 +78,10 @@ def evaluate_rows(blocks: CovarianceBlocks, first: int, last: int) -> Candidates
     """The same for the factors in the rows first .. last−1 of the graph."""
     graph = blocks.factored.graph
     rows = first + np.flatnonzero(is_first(graph.fac[first:last]))
-    many = graph.fac[rows, at.F_FLAGS] >> at.ROWS_SHIFT > 0
+    many = are_of_many(graph.fac[rows])
     if not many.any():
         return _of_pairs(blocks, rows)
-    sizes = _SIZES[graph.fac[rows, at.F_KIND], 0]
+    sizes = np.array([graph.kind_of(row).dim for row in rows.tolist()], np.int64)
     found = Candidates(sizes, np.empty(rows.size), np.empty(rows.size), np.zeros((rows.size, *(int(sizes.max()),) * 2)))
     few = np.flatnonzero(~many)
     pairs = _of_pairs(blocks, rows[few])

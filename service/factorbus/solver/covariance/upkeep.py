@@ -14,13 +14,12 @@ from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.recursion import diagonal_blocks, list_root_cliques
 from factorbus.solver.covariance.square_root import DIMS, LARGEST
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import are_of_many
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
-from factorbus.solver.graph.joints import negative_rows
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.candidates import evaluate_factors
-from factorbus.solver.kernels.model.kinds import LINEAR_OF_ONE
 
 # The most numbers of loops in all for a downdate, and the most new variables; with more all is computed anew.
 _MOST_RANKS, _MOST_NEW = 12, 8
@@ -99,17 +98,15 @@ class Upkeep:
     def _loops(self, old: int, first: int) -> list[int] | None:
         """The new factors but one for each new variable, which places it; None: not all are placed so.
 
-        Nor can there be a downdate by one of those of negative weight, or of more than two variables.
+        Nor can there be a downdate by a factor of more than two variables, or a linear one.
         """
         if self._count - old > _MOST_NEW:
             return None
         free = {v for v in range(old, self._count) if self._scalar[v] >= 0}
         loops = []
-        if (self._graph.fac[first : self._factors, at.F_KIND] == at.MEMBER).any():
+        if are_of_many(self._graph.fac[first : self._factors]).any():
             return None
         for k, row in enumerate(self._graph.fac[first : self._factors].tolist()):
-            if LINEAR_OF_ONE[row[at.F_KIND]] and negative_rows(self._graph, first).size:
-                return None
             ends = [v for v in (row[at.F_I], row[at.F_J]) if v in free]
             if not ends:
                 loops.append(k)

@@ -11,7 +11,7 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import losses_of, rows_of_factors, with_losses
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
+from factorbus.solver.graph.factors import LOSS_OF_CODE
 from factorbus.solver.graph.linearized import Linearized, linearized_factor
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -32,7 +32,6 @@ class FactorExplanation:
     inactive: why an observation has no pixel, and so no r (0) and no weight (0), and s is 900; else ""
     influence: tr(w Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
     without: by how much χ² would fall without it (10.8); None: nothing else measures what it does
-    of a piece of negative weight (`joints`) Ω = −L Lᵀ: χ² and influence are not above 0, and there is no `without`
     """
 
     factor: int
@@ -145,18 +144,17 @@ def _explained(blocks: CovarianceBlocks, index: int, linear: Linearized, T: F64)
     """linear, T: with r and H times √w, as the solver has them."""
     graph = blocks.factored.graph
     row, factor = graph.fac[index], int(graph.ids_of(np.array([index]))[0])
-    kind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
+    kind = graph.kind_of(index)
     d = kind.dim
     softened, W = linear.r, linear.W
     keys = tuple(int(graph.keys[v]) for v in linear.ends)
     r, s = _plain(graph, index)
     rho, inactive = _chi2(graph, index), observations.why_inactive(graph, index)
-    sign = -1.0 if W[0, 0] < 0.0 else 1.0
-    L = np.linalg.cholesky(sign * W)
+    L = np.linalg.cholesky(W)
     # I − Lᵀ T L has the share of each direction that the others know; where that is nothing, all is this factor's.
     M, whitened = L.T @ T @ L, L.T @ softened
     without = None
-    if sign > 0.0 and np.linalg.eigvalsh(np.eye(d) - M)[0] > _NOTHING:
+    if np.linalg.eigvalsh(np.eye(d) - M)[0] > _NOTHING:
         without = rho + float(whitened @ np.linalg.solve(np.eye(d) - M, M @ whitened))
     return FactorExplanation(
         factor, kind.name, keys, r, L.T @ r, s, d, float(np.trace(W @ T)), without,

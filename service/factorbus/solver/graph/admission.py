@@ -10,9 +10,8 @@ from factorbus.solver import errors
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.columns import Columns, floats_at, ints_at, limit_lenses, locate_columns
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, linear_of
 from factorbus.solver.graph.groups import BatchLike
-from factorbus.solver.graph.joints import check_joints
 from factorbus.solver.graph.triangulation import place_by_bearings
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph import group_table as gt
@@ -28,34 +27,30 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     find_first_outside,
 )
-from factorbus.solver.kernels.model.kinds import LINEAR, LINEAR_OF_ONE
 
 _NEAR = "choose units and an origin near the data"
 
 
-def admit(graph: FactorGraph, batch: BatchLike | Columns, whole: bool = True) -> int:
+def admit(graph: FactorGraph, batch: BatchLike | Columns) -> int:
     """Append `batch` to `graph` and give values to the variables that come without; gives the id of its first factor.
 
-    whole: a linear factor of one variable may have a negative definite Ω where those that came together make a form
-    that is positive semidefinite (`joints`); else it may not.
-
     Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, OutOfBounds,
-    BadQuaternion, BadRange, BadLens, BadObservation, BadLoss, NotPositiveDefinite, Apart, Uninitialized; `graph` is as
+    BadQuaternion, BadRange, BadLens, BadObservation, BadLoss, NotPositiveDefinite, Uninitialized; `graph` is as
     it was then.
     """
     raw, groups, problem = (batch.raw, batch.groups, None) if isinstance(batch, Columns) else locate_columns(batch)
     mark, first = graph.mark(), graph.next_id
     try:
-        fault, g, row, rest = admit_groups(raw, groups, whole, graph.array_table)
+        fault, g, row, rest = admit_groups(raw, groups, graph.array_table)
         if fault == gt.NO_LIMITS:
             raw, groups, lens = limit_lenses(raw, groups)
             problem = lens or problem
-            fault, g, row, rest = admit_groups(raw, groups, whole, graph.array_table)
+            fault, g, row, rest = admit_groups(raw, groups, graph.array_table)
         if fault == gt.NO_ROOM:
             graph.make_room(groups)
-            fault, g, row, rest = admit_groups(raw, groups, whole, graph.array_table)
+            fault, g, row, rest = admit_groups(raw, groups, graph.array_table)
         if g >= 0:
-            raise _find_bad_row(graph, raw, groups[g], row, fault, whole)
+            raise _find_bad_row(graph, raw, groups[g], row, fault)
         if problem is not None:
             raise problem
         if fault == gt.COMPOSED_OUT_OF_BOUNDS:
@@ -75,8 +70,6 @@ def _finish(graph: FactorGraph, groups: I64, mark: Mark, rest: int) -> None:
         _compose(graph, mark[at.VARIABLES], mark[at.FACTORS], _list_given(groups))
     if rest & gt.OBSERVED:
         observations.check(graph, mark[at.FACTORS])
-    if rest & gt.NEGATIVE:
-        check_joints(graph, mark[at.FACTORS])
 
 
 def _list_given(groups: I64) -> I64:
@@ -117,24 +110,30 @@ def _find_missing(graph: FactorGraph, first: int, first_factor: int, reached: I6
     return int(reach(True, first, first_factor, int(graph.counts[at.FACTORS]), graph.array_table, reached))
 
 
-def _find_bad_row(graph: FactorGraph, raw: bytes, group: I64, n: int, fault: int, whole: bool) -> errors.SolverError:
+def _find_bad_row(graph: FactorGraph, raw: bytes, group: I64, n: int, fault: int) -> errors.SolverError:
     """What is wrong with the n-th row of a group."""
     code, keys, numbers = (int(group[column]) for column in (gt.G_KIND, gt.G_KEYS, gt.G_NUMBERS))
     if not group[gt.G_FACTORS]:
         kind = VARIABLE_KIND_OF_CODE[code]
         value = floats_at(raw, numbers + 8 * n * kind.size, kind.size) if numbers != gt.NOWHERE else None
         return _bad_variable(kind.name, fault, int(ints_at(raw, keys + 8 * n, 1)[0]), value)
-    kind, loss = FACTOR_KIND_OF_CODE[code], int(group[gt.G_LOSS])
+    kind, loss = _kind_of(raw, group), int(group[gt.G_LOSS])
     if fault == gt.BAD_SCALE:
         scale = floats_at(raw, int(group[gt.G_SCALE]) + 8 * n, 1)[0]
         wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
         return errors.BadLoss(f"{kind} {LOSS_OF_CODE[loss]}", f"the scale {scale:g}", wanted)
     arity, triangle = len(kind.connects), kind.triangle
     information = floats_at(raw, int(group[gt.G_INFORMATION]) + 8 * n * triangle, triangle)
-    if whole and LINEAR_OF_ONE[code] and loss == at.NO_LOSS and information[0] < 0.0:
-        information = -information  # as it was looked at
     measured = floats_at(raw, numbers + 8 * n * kind.size, kind.size)
     return _bad_factor(graph, kind, fault, ints_at(raw, keys + 8 * n * arity, arity), measured, information)
+
+
+def _kind_of(raw: bytes, group: I64) -> FactorKind:
+    """The kind of a group of factors."""
+    if group[gt.G_KIND] != at.LINEAR:
+        return FACTOR_KIND_OF_CODE[int(group[gt.G_KIND])]
+    ends = ints_at(raw, int(group[gt.G_ENDS]), int(group[gt.G_ARITY]))
+    return linear_of(int(group[gt.G_ROWS]), tuple(ends.tolist()))
 
 
 def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.SolverError:
@@ -161,7 +160,7 @@ def _bad_factor(
     if wrong == gt.SELF_LOOP:
         return errors.SelfLoop(keys[later], where)
     if wrong == gt.BAD_QUATERNION:
-        return errors.BadQuaternion(where, float(np.linalg.norm(measured[3:7])))
+        return errors.BadQuaternion(where, _worst_norm(kind, measured))
     if wrong == gt.BAD_RANGE:
         return errors.BadRange(where, float(measured[min(1, kind.size - 1)]))
     if wrong == gt.BAD_DIRECTION:
@@ -173,9 +172,21 @@ def _bad_factor(
     return _number_out_of_bounds(kind, where, measured, information)
 
 
+def _worst_norm(kind: FactorKind, measured: F64) -> float:
+    """Of the quaternions of a measurement the length that is furthest from one."""
+    starts, here = [3], 0
+    if kind.code == at.LINEAR:
+        starts = []
+        for end in kind.connects:
+            starts += [here + 3] if end.name == "se3" else []
+            here += end.size
+    norms = [float(np.linalg.norm(measured[start : start + 4])) for start in starts]
+    return max(norms, key=lambda norm: abs(norm - 1.0))
+
+
 def _number_out_of_bounds(kind: FactorKind, where: str, measured: F64, information: F64) -> errors.SolverError:
     """Of a measurement or an information matrix."""
-    plain = sum(end.size for end in kind.connects) if LINEAR[kind.code] else kind.size
+    plain = sum(end.size for end in kind.connects) if kind.code == at.LINEAR else kind.size
     for numbers, most in ((measured[:plain], MOST_NUMBER), (measured[plain:], MOST_LINEAR)):
         if not (np.abs(numbers) <= most).all():
             return out_of_bounds(f"the measurement of {where}", numbers, most)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy import ndarray
 
+from factorbus.proto.kinds import FACTOR_KINDS as WIRE_KINDS
 from factorbus.solver import errors
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS, LENS_AT, LOSSES
 from factorbus.solver.graph.groups import BatchLike
@@ -24,6 +25,7 @@ _I64, _F64 = np.dtype("<i8"), np.dtype("<f8")
 _END = (gt.END,) + (0,) * (gt.G_WIDTH - 1)
 _WORD = 8
 _ABSENT = (None, ())  # the form of a column that is not there
+_NOT_LINEAR = (0, 0, 0, gt.NOWHERE)  # the last columns of a group that is not of linear factors
 
 
 class Columns(NamedTuple):
@@ -51,6 +53,8 @@ def locate_columns(batch: BatchLike) -> tuple[bytes, I64, errors.SolverError | N
     for group in batch.factors:
         keys, measured, information = group.keys, group.measured, group.information
         columns += (keys, measured, information)
+        if group.kind.startswith("linear_") and group.kind in WIRE_KINDS:
+            columns.append(_codes_of_ends(group.kind))
         form += (group.kind, group.loss)
         if type(keys) is type(measured) is type(information) is ndarray:
             form += (keys.dtype, keys.shape), (measured.dtype, measured.shape), (information.dtype, information.shape)
@@ -69,7 +73,7 @@ def locate_columns(batch: BatchLike) -> tuple[bytes, I64, errors.SolverError | N
     try:
         return b"".join(columns), groups, problem
     except TypeError:  # one of them is not contiguous
-        return b"".join([column.tobytes() for column in columns]), groups, problem
+        return b"".join([column if type(column) is bytes else column.tobytes() for column in columns]), groups, problem
 
 
 def limit_lenses(raw: bytes, groups: I64) -> tuple[bytes, I64, errors.SolverError | None]:
@@ -80,7 +84,7 @@ def limit_lenses(raw: bytes, groups: I64) -> tuple[bytes, I64, errors.SolverErro
         row = groups[g]
         if row[gt.G_KIND] == gt.END:
             break
-        kind = FACTOR_KIND_OF_CODE[int(row[gt.G_KIND])] if row[gt.G_FACTORS] else None
+        kind = FACTOR_KIND_OF_CODE.get(int(row[gt.G_KIND])) if row[gt.G_FACTORS] else None
         if kind is None or kind.name not in LENS_AT:
             continue
         row[gt.G_LIMITED], count = 1, int(row[gt.G_COUNT])
@@ -131,7 +135,7 @@ def _table_before(variables: int, form: tuple[Any, ...]) -> I64:
 
 def _count_columns(groups: I64) -> int:
     """How many columns the groups have."""
-    columns = groups[:-1, [gt.G_KEYS, gt.G_NUMBERS, gt.G_INFORMATION, gt.G_SCALE, gt.G_STAMPS]]
+    columns = groups[:-1, [gt.G_KEYS, gt.G_NUMBERS, gt.G_INFORMATION, gt.G_SCALE, gt.G_STAMPS, gt.G_ENDS]]
     return int(np.count_nonzero(columns != gt.NOWHERE))
 
 
@@ -153,12 +157,12 @@ def _iter_rows(variables: int, form: tuple[Any, ...]) -> Iterator[tuple[int, ...
             _check(stamps, _I64, (count,), name, "stamps")
             at_stamps, here = here, here + _WORD * count
         places = at_keys, at_values, gt.NOWHERE, gt.NOWHERE, at_stamps
-        yield kind.code, 0, count, bool(fixed), at.NO_LOSS, *places, 0
+        yield kind.code, 0, count, bool(fixed), at.NO_LOSS, *places, 0, *_NOT_LINEAR
     for k in range(variables, len(form), 6):
         name, loss, keys, measured, information, scale = form[k : k + 6]
         kind = FACTOR_KINDS.get(name)
         if kind is None:
-            raise errors.UnknownKind("factor", name, tuple(FACTOR_KINDS))
+            raise errors.UnknownKind("factor", name, WIRE_KINDS.names())
         _check(keys, _I64, (-1, len(kind.connects)), name, "keys")
         count = keys[1][0]
         _check(measured, _F64, (count, kind.size), name, "measured")
@@ -166,12 +170,20 @@ def _iter_rows(variables: int, form: tuple[Any, ...]) -> Iterator[tuple[int, ...
         at_keys, at_measured = here, here + _WORD * count * len(kind.connects)
         at_information = at_measured + _WORD * count * kind.size
         here = at_information + _WORD * count * kind.triangle
-        at_scale = gt.NOWHERE
+        at_scale, linear = gt.NOWHERE, _NOT_LINEAR
+        if kind.code == at.LINEAR:
+            linear, here = (len(kind.connects), kind.dim, kind.size, here), here + _WORD * len(kind.connects)
         if loss:
             _check_loss(name, loss, scale, count)
             at_scale, here = here, here + _WORD * count
         places = at_keys, at_measured, at_information, at_scale, gt.NOWHERE
-        yield kind.code, 1, count, 0, LOSSES[loss] if loss else at.NO_LOSS, *places, 0
+        yield kind.code, 1, count, 0, LOSSES[loss] if loss else at.NO_LOSS, *places, 0, *linear
+
+
+@lru_cache(maxsize=1024)
+def _codes_of_ends(kind: str) -> bytes:
+    """The codes of the kinds of the variables of linear factors."""
+    return np.array([end.code for end in FACTOR_KINDS[kind].connects], _I64).tobytes()
 
 
 def _check_loss(kind: str, loss: str, scale: tuple[Any, Any], count: int) -> None:

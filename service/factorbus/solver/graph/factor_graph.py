@@ -8,15 +8,21 @@ A factor's id is the number of factors that the map took in before it, and stays
 ids of the first rows are listed, those of the rows behind them follow each other without gaps.
 """
 
-from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
 
 from factorbus.solver.errors import printed
 from factorbus.solver.graph.arenas import Arenas, lines
-from factorbus.solver.graph.factor_rows import ends_of_rows, first_rows, is_first, losses_of, rows_of_each
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
+from factorbus.solver.graph.factor_rows import (
+    arities_of,
+    ends_of_rows,
+    first_rows,
+    is_first,
+    losses_of,
+    rows_of_arities,
+)
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, linear_of
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.graph.rows import Rows, Span
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -31,6 +37,9 @@ from factorbus.solver.kernels.model.retract import common_label, gather_values
 Mark: TypeAlias = tuple[int, ...]
 
 _MUCH = 4096  # rows
+# By the code of a kind; the last two are of linear factors, whose sizes are their own, and of members.
+_MEASURED = np.array([*(FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)), 0, 0], np.int64)
+_TRIANGLE = np.array([*(FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)), 0, 0], np.int64)
 _NO_KEYS: I64 = np.empty(0, np.int64)
 
 
@@ -98,11 +107,9 @@ class FactorGraph(Arenas):
         kinds = [VARIABLE_KIND_OF_CODE[code] for code in variables[:, gt.G_KIND].tolist()]
         counts = variables[:, gt.G_COUNT].tolist()
         self.reserve_variables(sum(counts), sum(n * kind.size for n, kind in zip(counts, kinds, strict=True)))
-        widths = [FACTOR_KIND_OF_CODE[code].width for code in factors[:, gt.G_KIND].tolist()]
-        counts = factors[:, gt.G_COUNT].tolist()
-        rows = [rows_of_each(FACTOR_KIND_OF_CODE[code]) for code in factors[:, gt.G_KIND].tolist()]
-        more = sum(n * of_each for n, of_each in zip(counts, rows, strict=True))
-        self.reserve_factors(more, sum(n * (width + 1) for n, width in zip(counts, widths, strict=True)))
+        counts, sizes = factors[:, gt.G_COUNT], np.array([_shape(group) for group in factors]).reshape(-1, 2)
+        more = int((counts * rows_of_arities(sizes[:, 0])).sum())
+        self.reserve_factors(more, int((counts * (sizes[:, 1] + 1)).sum()))
 
     def reserve_variables(self, more: int, numbers: int) -> None:
         """Make room for `more` variables and the numbers of all their values."""
@@ -240,25 +247,50 @@ class FactorGraph(Arenas):
         gather_values(rows, self.array_table, keys, values)
         return Group(kind.name, keys, values, bool(label % 2), self.stamps_of(rows))
 
-    def factors(self, most: int | None = None, apart: Sequence[Sequence[int]] = ()) -> list[FactorGroup]:
-        """All factors, or the first `most`: a copy, a group for each kind and loss.
+    def kind_of(self, row: int) -> FactorKind:
+        """The kind of the factor that begins at a row."""
+        code, flags = (int(n) for n in self.fac[row, [at.F_KIND, at.F_FLAGS]])
+        if code != at.LINEAR:
+            return FACTOR_KIND_OF_CODE[code]
+        return linear_of(flags >> at.DIM_SHIFT, tuple(self.var[self.ends_of(row), at.V_KIND].tolist()))
 
-        apart: rows that are to stay in their order: behind the others, groups for each of these.
-        """
+    def kinds_of(self, rows: I64) -> list[tuple[FactorKind, I64]]:
+        """The kinds of the factors that begin at these rows, each with the rows that it is of."""
+        codes, found = self.fac[rows, at.F_KIND], list[tuple[FactorKind, I64]]()
+        for code in np.flatnonzero(np.bincount(codes)).tolist() if rows.size else ():
+            of = rows[codes == code]
+            if code != at.LINEAR:
+                found.append((FACTOR_KIND_OF_CODE[code], of))
+                continue
+            linear: dict[FactorKind, list[int]] = {}
+            for row in of.tolist():
+                linear.setdefault(self.kind_of(row), []).append(row)
+            found += [(kind, np.array(of_kind)) for kind, of_kind in linear.items()]
+        return found
+
+    def sizes_of(self, rows: I64) -> tuple[I64, I64]:
+        """(numbers measured, numbers of the information) of each of these rows; none of those that begin no factor."""
+        fac = self.fac[rows]
+        measured, triangle = _MEASURED[fac[:, at.F_KIND]], _TRIANGLE[fac[:, at.F_KIND]]
+        for k in np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR).tolist():
+            kind = self.kind_of(int(rows[k]))
+            measured[k], triangle[k] = kind.size, kind.triangle
+        return measured, triangle
+
+    def factors(self, most: int | None = None) -> list[FactorGroup]:
+        """All factors, or those of the first `most` rows: a copy, a group for each kind and loss."""
         fac = self.fac[: self.counts[at.FACTORS]][:most]
-        label = (fac[:, at.F_KIND] << at.LOSS_SHIFT) + losses_of(fac)
-        others, runs = is_first(fac), []
-        for rows in apart:
-            of = np.array(rows)[np.array(rows) < len(fac)]
-            others[of] = False
-            runs += np.split(of, np.flatnonzero(np.diff(label[of])) + 1)
-        runs = [np.flatnonzero(others & (label == code)) for code in np.flatnonzero(np.bincount(label[others]))] + runs
-        return [self._group(fac, rows) for rows in runs if rows.size]
+        groups, losses = list[FactorGroup](), losses_of(fac)
+        for kind, rows in self.kinds_of(np.flatnonzero(is_first(fac))):
+            groups += [
+                self._group(kind, code, rows[losses[rows] == code])
+                for code in np.flatnonzero(np.bincount(losses[rows])).tolist()
+            ]
+        return groups
 
-    def _group(self, fac: I64, rows: I64) -> FactorGroup:
+    def _group(self, kind: FactorKind, code: int, rows: I64) -> FactorGroup:
         """Factors of one kind and loss."""
-        kind, code = FACTOR_KIND_OF_CODE[int(fac[rows[0], at.F_KIND])], int(losses_of(fac[rows[0]]))
-        loss, picked = LOSS_OF_CODE.get(code, ""), fac[rows]
+        fac, loss, picked = self.fac, LOSS_OF_CODE.get(code, ""), self.fac[rows]
         ends = self.keys[ends_of_rows(fac, rows, len(kind.connects))]
         width = kind.width + (1 if loss else 0)
         numbers = self.payload[picked[:, at.F_AT, None] + np.arange(width)]
@@ -282,8 +314,8 @@ class FactorGraph(Arenas):
 
     def ends_of(self, row: int) -> list[int]:
         """The variables of the factor that begins at a row."""
-        kind = FACTOR_KIND_OF_CODE[int(self.fac[row, at.F_KIND])]
-        return ends_of_rows(self.fac, np.array([row]), len(kind.connects))[0].tolist()
+        arity = int(arities_of(self.fac[row : row + 1])[0])
+        return ends_of_rows(self.fac, np.array([row]), arity)[0].tolist()
 
     def columns_bytes(self) -> tuple[int, int]:
         """Bytes of all variables, and of all factors, as columns, keys and stamps included."""
@@ -292,9 +324,17 @@ class FactorGraph(Arenas):
 
     def describe(self, row: int) -> str:
         """The factor that begins at a row, for a person."""
-        kind: FactorKind = FACTOR_KIND_OF_CODE[int(self.fac[row, at.F_KIND])]
         ends = [int(self.keys[v]) for v in self.ends_of(row)]
-        return f"{kind} ({', '.join(printed(key) for key in ends)})"
+        return f"{self.kind_of(row)} ({', '.join(printed(key) for key in ends)})"
+
+
+def _shape(group: I64) -> tuple[int, int]:
+    """(variables, numbers of a measurement and its information) of each factor of a group."""
+    if group[gt.G_KIND] == at.LINEAR:
+        rows = int(group[gt.G_ROWS])
+        return int(group[gt.G_ARITY]), int(group[gt.G_SIZE]) + rows * (rows + 1) // 2
+    kind = FACTOR_KIND_OF_CODE[int(group[gt.G_KIND])]
+    return len(kind.connects), kind.width
 
 
 def with_room(array: np.ndarray, need: int) -> np.ndarray:

@@ -5,7 +5,6 @@ A factor of more than two variables has a row for each pair of them (`kernels/mo
 
 import numpy as np
 
-from factorbus.solver.graph.factors import FactorKind
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 
@@ -22,10 +21,9 @@ def with_losses(flags: I64, losses: I64 | int) -> I64:
     return flags & ~_LOSS | losses << at.LOSS_SHIFT
 
 
-def rows_of_each(kind: FactorKind) -> int:
-    """How many rows a factor of a kind has."""
-    ends = len(kind.connects)
-    return ends * (ends - 1) // 2 if ends > 2 else 1
+def rows_of_arities(ends: I64) -> I64:
+    """How many rows factors of these numbers of variables have."""
+    return np.where(ends > 2, ends * (ends - 1) // 2, 1)
 
 
 def first_rows(fac: I64) -> I64:
@@ -40,7 +38,7 @@ def is_first(fac: I64) -> np.ndarray:
 
 def rows_of_factors(fac: I64, rows: I64) -> I64:
     """All rows of the factors that begin at these rows, in their order."""
-    counts = np.maximum(fac[rows, at.F_FLAGS] >> at.ROWS_SHIFT, 1)
+    counts = rows_of_arities(fac[rows, at.F_FLAGS] >> at.ENDS_SHIFT & at.ENDS_MASK)
     if (counts == 1).all():
         return rows
     return np.repeat(rows, counts) + np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -61,6 +59,18 @@ def ends_of_rows(fac: I64, rows: I64, arity: int) -> I64:
     return np.column_stack([fac[rows, at.F_I], *(fac[rows + n, at.F_J] for n in range(arity - 1))])
 
 
+def arities_of(fac: I64) -> I64:
+    """(n,) How many variables the factors have whose first rows these are."""
+    own = fac[:, at.F_FLAGS] >> at.ENDS_SHIFT & at.ENDS_MASK
+    return np.where(own > 0, own, np.where(fac[:, at.F_J] >= 0, 2, 1))
+
+
+def are_of_many(fac: I64) -> np.ndarray:
+    """Which rows (n,) are of factors that `many` evaluates: of more than two variables, or linear ones."""
+    return fac[:, at.F_FLAGS] >> at.OFFSET_SHIFT != 0
+
+
 def mount_variables(fac: I64) -> I64:
-    """The variables that are mounts of sensors: the last of each factor of three variables."""
-    return np.unique(fac[np.flatnonzero(fac[:, at.F_FLAGS] >> at.ROWS_SHIFT) + 1, at.F_J])
+    """The variables that are mounts of sensors: the last of each factor of three that is no linear one."""
+    of_three = fac[:, at.F_FLAGS] >> at.ENDS_SHIFT & at.ENDS_MASK == 3
+    return np.unique(fac[np.flatnonzero(of_three & (fac[:, at.F_KIND] != at.LINEAR)) + 1, at.F_J])

@@ -4,6 +4,8 @@ To declare a kind is told in CONTRIBUTING.md.  Tests are run for every entry of 
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 from factorbus.proto import kinds as wire
 from factorbus.solver.graph.variables import VARIABLE_KINDS, VariableKind
@@ -42,13 +44,38 @@ class FactorKind:
 
 def _kind(kind: wire.FactorKind) -> FactorKind:
     ends = tuple(VARIABLE_KINDS[end] for end in kind.connects)
-    code, model = layout.FACTOR_CODES[kind.name], FACTOR_MODELS[kind.name]
-    return FactorKind(kind.name, code, ends, kind.size, kind.dim, kind.measured, model.equation)
+    code, equation = layout.LINEAR, "MATH (3.26)"
+    if not kind.is_linear:
+        code, equation = layout.FACTOR_CODES[kind.name], FACTOR_MODELS[kind.name].equation
+    return FactorKind(kind.name, code, ends, kind.size, kind.dim, kind.measured, equation)
 
 
-FACTOR_KINDS = {name: _kind(kind) for name, kind in wire.FACTOR_KINDS.items()}
+class _FactorKinds(dict[str, FactorKind]):
+    """By name, as `factorbus.proto.kinds.FACTOR_KINDS`: linear ones are found, and are not among the entries."""
+
+    def __missing__(self, name: str) -> FactorKind:
+        return _linear(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The kind of that name, or `default`."""
+        return super().get(name) or (_linear(name) if name in wire.FACTOR_KINDS else default)
+
+
+@lru_cache(maxsize=1024)
+def _linear(name: str) -> FactorKind:
+    return _kind(wire.FACTOR_KINDS[name])
+
+
+def linear_of(rows: int, ends: tuple[int, ...]) -> FactorKind:
+    """The kind of linear factors with that number of rows on variables of kinds with these codes."""
+    return _linear("_".join(["linear", str(rows), *(_VARIABLE_NAMES[code] for code in ends)]))
+
+
+_VARIABLE_NAMES = {kind.code: name for name, kind in VARIABLE_KINDS.items()}
+FACTOR_KINDS = _FactorKinds((name, _kind(kind)) for name, kind in wire.FACTOR_KINDS.items())
 # Where in a measurement the code of its lens is.
 LENS_AT = {name: model.lens_at for name, model in FACTOR_MODELS.items() if model.lens_at >= 0}
 LOSSES = layout.LOSS_CODES
 LOSS_OF_CODE = {code: name for name, code in LOSSES.items()}
+# All but linear ones, whose code says nothing of their variables.
 FACTOR_KIND_OF_CODE = {kind.code: kind for kind in FACTOR_KINDS.values()}

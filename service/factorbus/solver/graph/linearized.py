@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.graph.factor_rows import are_of_many
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -34,9 +34,9 @@ class Linearized:
 
 def linearized_factor(graph: FactorGraph, row: int) -> Linearized:
     """The factor that begins at this row of `fac`."""
-    dim, ends = FACTOR_KIND_OF_CODE[int(graph.fac[row, at.F_KIND])].dim, np.array(graph.ends_of(row), np.int64)
+    dim, ends = graph.kind_of(row).dim, np.array(graph.ends_of(row), np.int64)
     dims = np.array([VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])].dim for v in ends], np.int64)
-    if ends.size > 2:
+    if are_of_many(graph.fac[row : row + 1])[0]:
         found = Linearized(ends, dims, np.empty(dim), np.empty((dim, int(dims.sum()))), np.empty((dim, dim)))
         evaluate_many(row, graph.array_table, graph.values, found.r, found.J, found.W)
         return found

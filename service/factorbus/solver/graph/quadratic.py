@@ -1,12 +1,13 @@
 """What some factors say of their variables together, to second order at the estimate: dense, for a few of them."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FactorKind
+from factorbus.solver.graph.factor_rows import are_of_many
+from factorbus.solver.graph.factors import FactorKind
 from factorbus.solver.graph.linearized import Linearized, linearized_factor
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VariableKind
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -18,14 +19,13 @@ from factorbus.solver.kernels.model.candidates import evaluate_factors
 class Quadratic:
     """χ² of some factors, x ⊟ y around the estimate: δᵀ Λ δ − 2 ηᵀ δ + ..., over free variables in this order.
 
-    starts: where each begins in δ   plus: the diagonal that Λ would have without factors of negative weight
+    starts: where each begins in δ
     """
 
     variables: list[int]
     starts: dict[int, int]
     information: F64
     eta: F64
-    plus: F64
 
 
 def quadratic(graph: FactorGraph, rows: Iterable[int], first: list[int]) -> Quadratic:
@@ -35,12 +35,12 @@ def quadratic(graph: FactorGraph, rows: Iterable[int], first: list[int]) -> Quad
     variables, starts, size = [*first, *sorted(v for v in ends if graph.var[v, at.V_COLUMN] >= 0)], {}, 0
     for v in variables:
         starts[v], size = size, size + kind_of(graph, v).dim
-    information, eta, plus = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    for kind, of in _by_kind(graph, rows):
-        if len(kind.connects) > 2:
-            for row in of.tolist():
-                _add_many(linearized_factor(graph, row), starts, information, eta, plus)
-            continue
+    information, eta = np.zeros((size, size)), np.zeros(size)
+    picked = np.array(rows, np.int64)
+    of_many = are_of_many(graph.fac[picked])
+    for row in picked[of_many].tolist():
+        _add_many(linearized_factor(graph, row), starts, information, eta)
+    for kind, of in graph.kinds_of(picked[~of_many]):
         J, W, r = _evaluated(graph, kind, of)
         there = graph.fac[of, at.F_I : at.F_I + len(kind.connects)]
         place = np.array([[starts.get(v, -1) for v in ends] for ends in there.tolist()])
@@ -54,13 +54,11 @@ def quadratic(graph: FactorGraph, rows: Iterable[int], first: list[int]) -> Quad
                 at_f = place[:, f, None] + np.arange(other.dim)
                 added = (J[f].transpose(0, 2, 1) @ WJ)[both]
                 np.add.at(information, (at_f[both][:, :, None], at_e[both][:, None, :]), added)
-                if e == f:
-                    np.add.at(plus, at_e[both], np.maximum(added.diagonal(axis1=1, axis2=2), 0.0))
-    return Quadratic(variables, starts, information, eta, plus)
+    return Quadratic(variables, starts, information, eta)
 
 
-def _add_many(factor: Linearized, starts: dict[int, int], information: F64, eta: F64, plus: F64) -> None:
-    """Add a factor of more than two variables."""
+def _add_many(factor: Linearized, starts: dict[int, int], information: F64, eta: F64) -> None:
+    """Add a factor of any number of variables."""
     place = np.concatenate(
         [
             starts[v] + np.arange(d) if v in starts else np.full(d, -1)
@@ -71,14 +69,6 @@ def _add_many(factor: Linearized, starts: dict[int, int], information: F64, eta:
     added = (factor.J.T @ WJ)[np.ix_(inside, inside)]
     information[np.ix_(place[inside], place[inside])] += added
     eta[place[inside]] -= WJ.T[inside] @ factor.r
-    plus[place[inside]] += added.diagonal()
-
-
-def _by_kind(graph: FactorGraph, rows: list[int]) -> Iterator[tuple[FactorKind, I64]]:
-    picked = np.array(rows, np.int64)
-    codes = graph.fac[picked, at.F_KIND]
-    for code in np.unique(codes).tolist():
-        yield FACTOR_KIND_OF_CODE[code], picked[codes == code]
 
 
 def _evaluated(graph: FactorGraph, kind: FactorKind, rows: I64) -> tuple[list[F64], F64, F64]:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
+from factorbus.solver.graph.factor_rows import rows_of_factors
 from factorbus.solver.kernels.graph.initialize import join, reach
 from factorbus.solver.kernels.graph.observability import mark_determined
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -39,13 +40,17 @@ def find_undetermined(graph: FactorGraph, since: Mark) -> I64:
 
 
 def find_unanchored(graph: FactorGraph, since: Mark) -> int:
-    """A variable after `since` that no factors join, however indirectly, to one that is fixed or has a prior; or −1."""
+    """A variable after `since` that no factors join, however indirectly, to one that is fixed or has a prior; or −1.
+
+    A linear factor may say where its variables are in the map: the numbers tell.
+    """
     first, last = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
     factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
     anchored = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
     fac = graph.fac[factors[0] : factors[1]]
-    priors = fac[fac[:, at.F_J] < 0, at.F_I]
-    anchored[priors[priors >= first] - first] = 1
+    linear = rows_of_factors(fac, np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR))
+    anchors = np.concatenate([fac[fac[:, at.F_J] < 0, at.F_I], fac[linear, at.F_I], fac[linear, at.F_J]])
+    anchored[anchors[anchors >= first] - first] = 1
     return int(join(first, last, *factors, graph.fac, anchored, np.empty(last - first + 1, np.int64)))
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factor_rows import losses_of
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.graph.factor_rows import ends_of_rows, losses_of
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FactorKind
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.rotation_matrices import matrices_of_angles, matrices_of_quaternions
@@ -31,18 +31,16 @@ class PoseSpace:
     landmark: int
     position: int
     bearing: int
-    linear_pair: int
-    linear: int
     between_mount: int
 
 
 PLANE = PoseSpace(
     2, at.SE2, at.POINT2, at.PRIOR_SE2, at.PRIOR_POINT2, at.BETWEEN_SE2, at.LANDMARK_SE2, at.POSITION_SE2,
-    at.BEARING_SE2, at.LINEAR_PAIR_SE2, at.LINEAR_SE2, at.FACTOR_CODES["between_se2_mount"],
+    at.BEARING_SE2, at.FACTOR_CODES["between_se2_mount"],
 )  # fmt: skip
 SPACE = PoseSpace(
     3, at.SE3, at.POINT3, at.PRIOR_SE3, at.PRIOR_POINT3, at.BETWEEN_SE3, at.LANDMARK_SE3, at.POSITION_SE3,
-    at.BEARING_SE3, at.LINEAR_PAIR_SE3, at.LINEAR_SE3, at.FACTOR_CODES["between_se3_mount"],
+    at.BEARING_SE3, at.FACTOR_CODES["between_se3_mount"],
 )  # fmt: skip
 
 
@@ -115,7 +113,7 @@ def _parts(graph: FactorGraph, space: PoseSpace) -> list[tuple[np.ndarray, ...]]
     parts = [_poses(graph, space, space.between), _poses(graph, space, space.prior)]
     parts += [_points(graph, space, space.landmark), _points(graph, space, space.prior_point)]
     parts += [_between_sensors(graph, space), _positions(graph, space), _bearings(graph, space)]
-    parts += [_linear_pairs(graph, space), _linear(graph, space)]
+    parts += [_linear(graph, space, rows) for rows in _linear_factors(graph, space)]
     if space.dim == 2:
         parts += [_bearing_ranges(graph), _headings(graph)]
     return parts
@@ -134,17 +132,16 @@ def _rows(graph: FactorGraph, kind: int) -> tuple[I64, I64, F64, F64]:
     return rows, picked, numbers[:, : declared.size], information
 
 
-def _losses(graph: FactorGraph, kind: int, fac: I64) -> tuple[I64, F64]:
+def _losses(graph: FactorGraph, rows: I64, fac: I64) -> tuple[I64, F64]:
     """The codes of the losses, and their scales."""
-    declared, loss = FACTOR_KIND_OF_CODE[kind], losses_of(fac)
+    loss = losses_of(fac)
     scale, robust = np.ones(len(fac)), np.flatnonzero(loss != at.NO_LOSS)
-    scale[robust] = graph.payload[fac[robust, at.F_AT] + declared.size + declared.triangle]
+    scale[robust] = graph.payload[fac[robust, at.F_AT] + sum(graph.sizes_of(rows[robust]))]
     return loss, scale
 
 
 def _made(
     graph: FactorGraph,
-    kind: int,
     rows: I64,
     fac: I64,
     a: I64,
@@ -160,7 +157,7 @@ def _made(
         "lever": np.zeros((m, d)),
     }  # fmt: skip
     got = nothing | more
-    loss, scale = _losses(graph, kind, fac)
+    loss, scale = _losses(graph, rows, fac)
     return a, b, got["R"], t, got["turn"], t_information, got["couple"], got["lever"], rows, loss, scale
 
 
@@ -178,7 +175,7 @@ def _poses(graph: FactorGraph, space: PoseSpace, kind: int) -> tuple[np.ndarray,
     a = fac[:, at.F_I] + 1 if kind == space.between else np.zeros(rows.size, np.int64)
     t_information = R @ information[:, :d, :d] @ R.transpose(0, 2, 1)
     turn, couple = _turn(information, d), R @ information[:, :d, d:]
-    return _made(graph, kind, rows, fac, a, b, t, t_information, R=R, turn=turn, couple=couple)
+    return _made(graph, rows, fac, a, b, t, t_information, R=R, turn=turn, couple=couple)
 
 
 def _between_sensors(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
@@ -192,8 +189,8 @@ def _between_sensors(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, 
     t = (Q @ t[:, :, None] - turned @ q[:, :, None])[:, :, 0] + q
     t_information = moved @ information[:, :d, :d] @ moved.transpose(0, 2, 1)
     a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
-    kind, turn = space.between_mount, _turn(information, d)
-    return _made(graph, kind, rows, fac, a, b, t, t_information, R=turned, turn=turn)
+    turn = _turn(information, d)
+    return _made(graph, rows, fac, a, b, t, t_information, R=turned, turn=turn)
 
 
 def _turn(information: F64, d: int) -> F64:
@@ -210,7 +207,7 @@ def _points(graph: FactorGraph, space: PoseSpace, kind: int) -> tuple[np.ndarray
     seen = kind == space.landmark
     a = fac[:, at.F_I] + 1 if seen else np.zeros(rows.size, np.int64)
     b = fac[:, at.F_J if seen else at.F_I] + 1
-    return _made(graph, kind, rows, fac, a, b, measured, information)
+    return _made(graph, rows, fac, a, b, measured, information)
 
 
 def _bearing_ranges(graph: FactorGraph) -> tuple[np.ndarray, ...]:
@@ -220,7 +217,7 @@ def _bearing_ranges(graph: FactorGraph) -> tuple[np.ndarray, ...]:
     g = np.stack([np.stack([-u[:, 1], u[:, 0]], axis=1) / distance[:, None], u], axis=1)
     t_information = g.transpose(0, 2, 1) @ information @ g
     a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
-    return _made(graph, at.BEARING_RANGE_SE2, rows, fac, a, b, distance[:, None] * u, t_information)
+    return _made(graph, rows, fac, a, b, distance[:, None] * u, t_information)
 
 
 def _bearings(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
@@ -234,7 +231,7 @@ def _bearings(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     weight = np.trace(information, axis1=1, axis2=2) / information.shape[1] / distance**2
     a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
     t_information = weight[:, None, None] * across
-    return _made(graph, space.bearing, rows, fac, a, b, distance[:, None] * u, t_information)
+    return _made(graph, rows, fac, a, b, distance[:, None] * u, t_information)
 
 
 def _value(graph: FactorGraph, variables: I64, numbers: int) -> F64:
@@ -246,7 +243,7 @@ def _positions(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, space.position)
     d, a = space.dim, np.zeros(rows.size, np.int64)
     b, lever = fac[:, at.F_I] + 1, measured[:, d:]
-    return _made(graph, space.position, rows, fac, a, b, measured[:, :d], information, lever=lever)
+    return _made(graph, rows, fac, a, b, measured[:, :d], information, lever=lever)
 
 
 def _headings(graph: FactorGraph) -> tuple[np.ndarray, ...]:
@@ -255,36 +252,56 @@ def _headings(graph: FactorGraph) -> tuple[np.ndarray, ...]:
     nothing = np.zeros((rows.size, 2))
     t_information = np.zeros((rows.size, 2, 2))
     turn = information[:, 0, 0]
-    return _made(graph, at.HEADING_SE2, rows, fac, a, fac[:, at.F_I] + 1, nothing, t_information, R=R, turn=turn)
+    return _made(graph, rows, fac, a, fac[:, at.F_I] + 1, nothing, t_information, R=R, turn=turn)
 
 
-def _linear_pairs(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
-    """Two poses together: as they are to each other where the factor was linearized."""
-    rows, fac, measured, information = _rows(graph, space.linear_pair)
-    d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
-    (Ra, ta), (Rb, tb) = poses_apart(measured[:, :size]), poses_apart(measured[:, size : 2 * size])
-    H = measured[:, 2 * size + dim * dim : 2 * size + 2 * dim * dim].reshape(-1, dim, dim)
-    weight = np.maximum(np.einsum("mri,mrs,msi->mi", H, information, H), 0.0)
-    back = Ra.transpose(0, 2, 1)
-    t = (back @ (tb - ta)[:, :, None])[:, :, 0]
-    t_information = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
-    turn = weight[:, d:].mean(axis=1)
-    a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
-    return _made(graph, space.linear_pair, rows, fac, a, b, t, t_information, R=back @ Rb, turn=turn)
+def _linear_factors(graph: FactorGraph, space: PoseSpace) -> list[I64]:
+    """The rows of the linear factors of a single pose of this space, and of those that join poses, by their kinds."""
+    rows, found = np.flatnonzero(graph.fac[: graph.counts[at.FACTORS], at.F_KIND] == at.LINEAR), []
+    for kind, of in graph.kinds_of(rows):
+        poses = sum(end.code == space.pose for end in kind.connects)
+        if poses > 1 or (poses == 1 and len(kind.connects) == 1):
+            found.append(of)
+    return found
 
 
-def _linear(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
-    """A pose by itself: where the factor was linearized, if it says something of all of the pose."""
-    rows, fac, measured, information = _rows(graph, space.linear)
-    d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
-    R, t = poses_apart(measured[:, :size])
-    H = measured[:, size : size + dim * dim].reshape(-1, dim, dim)
-    weight = np.einsum("mri,mrs,msi->mi", H, information, H)
-    whole = (weight > 0.0).all(axis=1)
-    weight = np.where(whole[:, None], weight, 0.0)
-    t_information = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
-    a, b = np.zeros(rows.size, np.int64), fac[:, at.F_I] + 1
-    return _made(graph, space.linear, rows, fac, a, b, t, t_information, R=R, turn=weight[:, d:].mean(axis=1))
+def _linear(graph: FactorGraph, space: PoseSpace, rows: I64) -> tuple[np.ndarray, ...]:
+    """Linear factors of one kind: of each two poses the relative pose where the factor was linearized, weighed by the
+    block of both in HᵀΩH; of a single pose that pose, if the factor says something of all of it."""
+    kind, d, dim = graph.kind_of(int(rows[0])), space.dim, 3 if space.dim == 2 else 6
+    numbers = graph.payload[graph.fac[rows, at.F_AT, None] + np.arange(kind.width)]
+    y, H = _split(kind, numbers)
+    i, j = np.triu_indices(kind.dim)
+    information = np.empty((rows.size, kind.dim, kind.dim))
+    information[:, i, j] = information[:, j, i] = numbers[:, kind.size :]
+    poses = [n for n, end in enumerate(kind.connects) if end.code == space.pose]
+    ends = ends_of_rows(graph.fac, rows, len(kind.connects))
+    pairs = [(a, b) for k, b in enumerate(poses) for a in poses[:k]] or [(-1, poses[0])]
+    parts = []
+    for a, b in pairs:
+        (Rb, tb), Hb = poses_apart(y[b]), H[b]
+        WH = information @ Hb
+        weight = np.einsum("mri,mri->mi", Hb, WH)
+        if a < 0:
+            weight = np.where((weight > 0.0).all(axis=1, keepdims=True), weight, 0.0)
+            node, R, t = np.zeros(rows.size, np.int64), Rb, tb
+        else:
+            Ra, ta = poses_apart(y[a])
+            cross = np.abs(H[a].transpose(0, 2, 1) @ WH).max(axis=1)
+            weight, back = np.minimum(weight, cross), Ra.transpose(0, 2, 1)
+            node, R, t = ends[:, a] + 1, back @ Rb, (back @ (tb - ta)[:, :, None])[:, :, 0]
+        t_information = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
+        turn, of = weight[:, d:dim].mean(axis=1), graph.fac[rows]
+        parts.append(_made(graph, rows, of, node, ends[:, b] + 1, t, t_information, R=R, turn=turn))
+    return tuple(map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _split(kind: FactorKind, numbers: F64) -> tuple[list[F64], list[F64]]:
+    """y (m, size) and H (m, rows, d) of each variable of m linear factors."""
+    sizes, dims = [end.size for end in kind.connects], [end.dim for end in kind.connects]
+    *y, rest = np.split(numbers, np.cumsum(sizes), axis=1)
+    *H, _ = np.split(rest, np.cumsum([kind.dim * dim for dim in dims]), axis=1)
+    return y, [J.reshape(-1, kind.dim, dim) for J, dim in zip(H, dims, strict=True)]
 
 
 def _directions(graph: FactorGraph, space: PoseSpace) -> Directions:

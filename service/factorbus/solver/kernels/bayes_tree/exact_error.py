@@ -59,10 +59,10 @@ def exact_error(
 def exact_error_of_many(
     f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64
 ) -> tuple[float, float, float]:  # fmt: skip
-    """The same of a factor of more than two variables."""
+    """The same of a factor that `many` evaluates."""
     more, now = linearize_many(f, var, fac, values, payload)
     _, was = linearize_many(f, var, fac, lin, payload)
-    dim, kind, start = len(now.W), fac[f, at.F_KIND], now.start
+    dim, kind, start = len(now.J), fac[f, at.F_KIND], now.start
     chi2, force, total = more + square_of(now), 0.0, 0.0
     switched = is_camera(kind) and (was.r[at.R_STATUS] != GOOD) != (now.r[at.R_STATUS] != GOOD)
     for n in range(start.size - 1):
@@ -73,14 +73,12 @@ def exact_error_of_many(
             turned = diagonal = 0.0
             for a in range(dim):
                 was.r[a] += was.J[a, c] * delta[d + c - start[n]]
-                for b in range(dim):
-                    turned += (now.J[a, c] - was.J[a, c]) * now.W[a, b] * now.r[b]
-                    diagonal += now.J[a, c] * now.W[a, b] * now.J[b, c]
+                turned += (now.J[a, c] - was.J[a, c]) * now.r[a]
+                diagonal += now.J[a, c] * now.J[a, c]
             if diagonal > 0.0:
                 force += turned * turned / diagonal
     for a in range(dim):
-        for b in range(dim):
-            total += (now.r[a] - was.r[a]) * now.W[a, b] * (now.r[b] - was.r[b])
+        total += (now.r[a] - was.r[a]) * (now.r[a] - was.r[a])
     return SWITCHED if switched else math.sqrt(max(total, 0.0)), math.sqrt(force), chi2
 
 

@@ -2,15 +2,13 @@
 
 import math
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import has_free
 from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, shift_error_weight
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_isotropic
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import Panel, put, six
+from factorbus.solver.kernels.jit.simd import Panel, put, six, zero
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, row_of_pair
@@ -61,30 +59,25 @@ def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None
 
 @part
 def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
-    """The Hessians of all rows of the factor of more than two variables that begins at row f.
+    """The Hessians of all rows of the factor that begins at row f.
 
     The rows (0, 1), …, (0, n−1) have the diagonal block and the gradient of their second variable, the first row those
     of the first one and χ² too; what else there is room for is zero.  So the sum of the rows is the factor.
     """
     var, fac, out, link, state, totals = graph.var, graph.fac, tree.hessian, tree.link, tree.state, tree.totals
     more, many = linearize_many(f, var, fac, tree.lin[0], graph.payload)
-    dim, ends = len(many.W), many.start.size - 1
-    last = link[f, tl.L_AT] + hessian_size(width_of(0, many), width_of(1, many)) - 1
-    was, WJ = load(out, last), np.zeros(many.J.shape)
-    for a in range(dim):
-        for b in range(dim):
-            for c in range(many.start[ends]):
-                WJ[a, c] += many.W[a, b] * many.J[b, c]
-    for n in range(ends):
-        for m in range(n + 1, ends):
+    ends, last = many.start.size - 1, link[f, tl.L_AT] + hessian_size(width_of(0, many), width_of(1, many)) - 1
+    was = load(out, last)
+    for n in range(max(ends - 1, 1)):
+        for m in range(n + 1, max(ends, 2)):
             row = row_of_pair(f, n, m, ends)
             h, di, dj = link[row, tl.L_AT], width_of(n, many), width_of(m, many)
-            _block_of(n == 0 and m == 1, many, WJ, n, n, h, out)
-            _block_of(True, many, WJ, n, m, h + di * di, out)
-            _block_of(n == 0, many, WJ, m, m, h + di * di + di * dj, out)
+            _block_of(n == 0 and m == 1, many, n, n, h, out)
+            _block_of(m < ends, many, n, m, h + di * di, out)
+            _block_of(n == 0 and m < ends, many, m, m, h + di * di + di * dj, out)
             g = h + di * di + di * dj + dj * dj
-            _gradient_of(n == 0 and m == 1, many, WJ, n, g, out)
-            _gradient_of(n == 0, many, WJ, m, g + di, out)
+            _gradient_of(n == 0 and m == 1, many, n, g, out)
+            _gradient_of(n == 0 and m < ends, many, m, g + di, out)
             put(out, g + di + dj, 0.0)
     chi2 = more + square_of(many)
     put(out, last, chi2)
@@ -97,24 +90,24 @@ def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
 
 
 @inline_kernel
-def _block_of(has: bool, many: Many, WJ: F64, n: int, m: int, h: int, out: F64) -> None:
-    """J_nᵀ Ω J_m, row by row, from h on; zeros where it is elsewhere."""
-    start, e = many.start, many.start[m + 1] - many.start[m]
-    for i in range(start[n + 1] - start[n]):
-        for j in range(e):
-            total = 0.0
-            for a in range(len(WJ) if has else 0):
-                total += many.J[a, start[n] + i] * WJ[a, start[m] + j]
-            put(out, h + i * e + j, total)
+def _block_of(has: bool, many: Many, n: int, m: int, h: int, out: F64) -> None:
+    """J_nᵀ J_m, row by row, from h on; zeros where it is elsewhere."""
+    start, d, e = many.start, width_of(n, many), width_of(m, many)
+    zero(out, h, d * e)
+    for a in range(len(many.J) if has else 0):
+        for i in range(d):
+            left = many.J[a, start[n] + i]
+            for j in range(e if left != 0.0 else 0):
+                put(out, h + i * e + j, load(out, h + i * e + j) + left * many.J[a, start[m] + j])
 
 
 @inline_kernel
-def _gradient_of(has: bool, many: Many, WJ: F64, n: int, g: int, out: F64) -> None:
-    """−J_nᵀ Ω r from g on; zeros where it is elsewhere."""
-    for i in range(many.start[n + 1] - many.start[n]):
+def _gradient_of(has: bool, many: Many, n: int, g: int, out: F64) -> None:
+    """−J_nᵀ r from g on; zeros where it is elsewhere."""
+    for i in range(width_of(n, many)):
         total = 0.0
-        for a in range(len(WJ) if has else 0):
-            total += WJ[a, many.start[n] + i] * many.r[a]
+        for a in range(len(many.J) if has else 0):
+            total += many.J[a, many.start[n] + i] * many.r[a]
         put(out, g + i, -total)
 
 

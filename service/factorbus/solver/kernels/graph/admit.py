@@ -7,33 +7,37 @@ before it are in the graph then, for the function that names the fault, and the 
 import numpy as np
 
 from factorbus.solver.kernels.graph import group_table as gt
-from factorbus.solver.kernels.graph.check_rows import check_factor, check_value
+from factorbus.solver.kernels.graph.check_rows import (
+    check_information,
+    check_linear,
+    check_measurement,
+    check_value,
+)
 from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.graph.key_table import slot_of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find_outside
 from factorbus.solver.kernels.model.factor_rows import row_of_pair, rows_of_arity
-from factorbus.solver.kernels.model.kinds import is_camera, is_linear
+from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import (
-    MOST_ENDS,
     arity_of,
     dim_of,
     information_at,
     kind_of_end,
     kinds_of_ends,
-    scale_at,
+    residual_dim,
     size_of,
 )
 
 
-@kernel("UniTuple(int64, 4)(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], boolean, int64[::1])")
-def admit_groups(raw: bytes, groups: I64, whole: bool, graph_table: I64) -> tuple:
+@kernel("UniTuple(int64, 4)(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], int64[::1])")
+def admit_groups(raw: bytes, groups: I64, graph_table: I64) -> tuple:
     """Append the variables and factors whose columns lie in `raw`, and give values to the variables that come without.
 
-    groups (n + 1, G_WIDTH): where they lie, see `group_table`; that they lie inside is not checked.  whole: a linear
-    factor of one variable may have a negative definite Ω.  graph_table: of the graph's arrays (`records`).
+    groups (n + 1, G_WIDTH): where they lie, see `group_table`; that they lie inside is not checked.  graph_table: of
+    the graph's arrays (`records`).
 
     Gives (fault, group, row, rest): GOOD and what is left to be done; or what is wrong, with which row of which group.
     With NO_ROOM and NO_LIMITS nothing was done.
@@ -44,7 +48,6 @@ def admit_groups(raw: bytes, groups: I64, whole: bool, graph_table: I64) -> tupl
     if fault != gt.GOOD:
         return fault, -1, -1, 0
     v0, f0, rest = counts[at.VARIABLES], counts[at.FACTORS], 0
-    scratch = np.empty((6, 6))
     for factors in range(2):
         g = 0
         while groups[g, gt.G_KIND] != gt.END:
@@ -52,7 +55,7 @@ def admit_groups(raw: bytes, groups: I64, whole: bool, graph_table: I64) -> tupl
                 if factors == 0:
                     row, fault = append_variables(raw, groups[g], graph)
                 else:
-                    row, fault, left = append_factors(raw, groups[g], whole, graph, scratch)
+                    row, fault, left = append_factors(raw, groups[g], graph)
                     rest |= left
                 if fault != gt.GOOD:
                     return fault, g, row, 0
@@ -79,8 +82,9 @@ def look_over(groups: I64, graph: Graph) -> int:
         if groups[g, gt.G_FACTORS] == 0:
             variables, numbers = variables + count, numbers + count * size_of(kind)
         else:
-            factors += count * rows_of_arity(arity_of(kind))
-            measured += count * (scale_at(kind) + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0))
+            arity, dim, size = shape_of(groups[g])
+            factors += count * rows_of_arity(arity)
+            measured += count * (size + dim * (dim + 1) // 2 + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0))
             if is_camera(kind) and groups[g, gt.G_LIMITED] == 0:
                 return gt.NO_LIMITS
         g += 1
@@ -116,46 +120,53 @@ def append_variables(raw: bytes, group: I64, graph: Graph) -> tuple:
     return -1, gt.GOOD
 
 
+@inline_kernel
+def shape_of(group: I64) -> tuple:
+    """(variables, numbers of a residual, numbers measured) of each factor of a group."""
+    kind = group[gt.G_KIND]
+    if kind == at.LINEAR:
+        return group[gt.G_ARITY], group[gt.G_ROWS], group[gt.G_SIZE]
+    return arity_of(kind), residual_dim(kind), information_at(kind)
+
+
 @part
-def append_factors(raw: bytes, group: I64, whole: bool, graph: Graph, scratch: F64) -> tuple:
+def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
     """Append the factors of a group.  Gives (row, fault, what is left to be done for them): of the first that is not in
-    order, or (−1, GOOD, …).  scratch (6, 6)."""
+    order, or (−1, GOOD, …)."""
     kind, loss, payload, counts = group[gt.G_KIND], group[gt.G_LOSS], graph.payload, graph.counts
-    size, width = information_at(kind), scale_at(kind)
-    triangle, arity, ends = width - size, arity_of(kind), np.empty(MOST_ENDS, np.int64)
-    may_be_negative = whole and loss == at.NO_LOSS and arity == 1 and is_linear(kind)
+    arity, dim, size = shape_of(group)
+    triangle, ends, kinds = dim * (dim + 1) // 2, np.empty(arity, np.int64), np.empty(arity, np.int64)
+    for n in range(arity):
+        kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if kind == at.LINEAR else kind_of_end(kind, n)
+    is_many, scratch = kind == at.LINEAR or arity > 2, np.empty((dim, dim))
     rest = gt.OBSERVED if is_camera(kind) else 0
     for n in range(group[gt.G_COUNT]):
         p, first = counts[at.PAYLOAD], group[gt.G_KEYS] + 8 * n * arity
         i = j = -1
-        if arity <= 2:
-            i, j, fault = find_ends(kind, int_at(raw, first), int_at(raw, first + 8 * (arity - 1)), graph)
+        if is_many:
+            fault = find_many_ends(kinds, raw, first, graph, ends)
         else:
-            fault = find_many_ends(kind, raw, first, graph, ends)
+            i, j, fault = find_ends(kind, int_at(raw, first), int_at(raw, first + 8 * (arity - 1)), graph)
         if fault != gt.GOOD:
             return n, fault, rest
         copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p)
         copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
-        is_negative = may_be_negative and payload[p + size] < 0.0
-        if is_negative:
-            negate(p + size, triangle, payload)
-            rest |= gt.NEGATIVE
-        fault = check_factor(kind, p, size, triangle, payload, scratch)
+        fault = check_linear(kinds, p, size, payload) if kind == at.LINEAR else check_measurement(kind, p, payload)
+        if fault == gt.GOOD:
+            fault = check_information(dim, p + size, payload, scratch)
         if fault != gt.GOOD:
             return n, fault, rest
-        if is_negative:
-            negate(p + size, triangle, payload)
-        numbers = width
+        numbers = size + triangle
         if loss != at.NO_LOSS:
             scale = float_at(raw, group[gt.G_SCALE] + 8 * n)
             if not (scale >= LEAST_SCALE and scale <= MOST_NUMBER):
                 return n, gt.BAD_SCALE, rest
-            payload[p + width] = scale
+            payload[p + numbers] = scale
             numbers += 1
-        if arity <= 2:
-            append_factor(kind, loss, i, j, numbers, graph)
+        if is_many:
+            append_rows(kind, loss, dim, ends, numbers, graph)
         else:
-            append_pair_rows(kind, loss, ends[:arity], numbers, graph)
+            append_factor(kind, loss, i, j, numbers, graph)
     return -1, gt.GOOD, rest
 
 
@@ -201,16 +212,16 @@ def find_ends(kind: int, a: int, b: int, graph: Graph) -> tuple:
 
 
 @part
-def find_many_ends(kind: int, raw: bytes, keys: int, graph: Graph, ends: I64) -> int:
-    """Write to `ends` the variables whose keys begin at raw[keys], for a factor of that kind of more than two.
+def find_many_ends(kinds: I64, raw: bytes, keys: int, graph: Graph, ends: I64) -> int:
+    """Write to `ends` the variables whose keys begin at raw[keys], for a factor of variables of these `kinds`.
 
     Gives GOOD, or what is wrong: of which variable with LATER_END more for each before it.
     """
-    for n in range(arity_of(kind)):
+    for n in range(kinds.size):
         v = graph.table[slot_of(int_at(raw, keys + 8 * n), graph.table, graph.keys)] - 1
         if v < 0:
             return gt.UNKNOWN_FIRST + gt.LATER_END * n
-        if graph.var[v, at.V_KIND] != kind_of_end(kind, n):
+        if graph.var[v, at.V_KIND] != kinds[n]:
             return gt.WRONG_KIND_FIRST + gt.LATER_END * n
         for m in range(n):
             if ends[m] == v:
@@ -220,18 +231,19 @@ def find_many_ends(kind: int, raw: bytes, keys: int, graph: Graph, ends: I64) ->
 
 
 @part
-def append_pair_rows(kind: int, loss: int, ends: I64, numbers: int, graph: Graph) -> None:
-    """One more factor of more than two variables: a row for each pair of them (`factor_rows`)."""
+def append_rows(kind: int, loss: int, dim: int, ends: I64, numbers: int, graph: Graph) -> None:
+    """One more factor that `many` evaluates: a row, or one for each pair of its variables (`factor_rows`)."""
     fac, counts, count = graph.fac, graph.counts, rows_of_arity(ends.size)
     first = counts[at.FACTORS]
-    for n in range(ends.size):
-        for m in range(n + 1, ends.size):
-            f = row_of_pair(first, n, m, ends.size)
-            fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT] = at.MEMBER, ends[n], ends[m], -1
+    for n in range(max(ends.size - 1, 1)):
+        for m in range(n + 1, max(ends.size, 2)):
+            f = row_of_pair(first, n, m, max(ends.size, 2))
+            fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_AT] = at.MEMBER, ends[n], -1
+            fac[f, at.F_J] = ends[m] if m < ends.size else -1
             fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ] = -1, -1, -1
             fac[f, at.F_FLAGS] = (f - first) << at.OFFSET_SHIFT
     fac[first, at.F_KIND], fac[first, at.F_AT] = kind, counts[at.PAYLOAD]
-    fac[first, at.F_FLAGS] = count << at.ROWS_SHIFT | loss << at.LOSS_SHIFT
+    fac[first, at.F_FLAGS] = dim << at.DIM_SHIFT | ends.size << at.ENDS_SHIFT | loss << at.LOSS_SHIFT
     counts[at.PAYLOAD] += numbers
     counts[at.FACTORS] += count
     counts[at.MEMBERS] += count - 1
@@ -294,10 +306,3 @@ def int_at(raw: bytes, start: int) -> int:
     for k in range(8):
         bits |= np.int64(raw[start + k]) << np.int64(8 * k)
     return bits  # type: ignore[return-value]
-
-
-@inline_kernel
-def negate(start: int, count: int, numbers: F64) -> None:
-    """Change the sign of `count` numbers from `start` on."""
-    for c in range(start, start + count):
-        numbers[c] = -numbers[c]

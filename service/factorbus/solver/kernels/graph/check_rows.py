@@ -6,7 +6,7 @@ The numbers are those that stand behind the ones in use, in the arenas of the gr
 import math
 
 from factorbus.solver.kernels.graph import group_table as gt
-from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import (
     LEAST_INFORMATION,
@@ -15,9 +15,9 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     are_within,
 )
-from factorbus.solver.kernels.model.kinds import direction_at, is_checked, is_linear, positive_at, quaternion_at
+from factorbus.solver.kernels.model.kinds import direction_at, positive_at, quaternion_at
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.sizes import residual_dim, values_of_ends
+from factorbus.solver.kernels.model.sizes import information_at, size_of
 
 # A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
 _QUATERNION_TOLERANCE = 1e-3
@@ -39,38 +39,39 @@ def check_value(kind: int, x: int, size: int, values: F64) -> int:
     return gt.GOOD
 
 
-@inline_kernel
-def check_factor(kind: int, p: int, size: int, triangle: int, payload: F64, scratch: F64) -> int:
-    """What is wrong with the new measurement that starts at p, or with its information."""
-    if not (are_within_kind(kind, p, size, payload) and are_within(MOST_INFORMATION, p + size, triangle, payload)):
-        return gt.OUT_OF_BOUNDS
-    if is_checked(kind):
-        wrong = check_measurement(kind, p, payload)
-        if wrong != gt.GOOD:
-            return wrong
-    dim = residual_dim(kind)
-    if not is_positive_definite(dim, payload, p + size, scratch):
-        return gt.NOT_POSITIVE_DEFINITE
-    c = p + size
-    for a in range(dim):
-        if payload[c] < LEAST_INFORMATION:
+@part
+def check_linear(kinds: I64, p: int, size: int, payload: F64) -> int:
+    """What is wrong with a new linear model of variables of these kinds, whose numbers start at p: y within the bounds
+    of values, quaternions of unit length, H and b within those of what R may hold."""
+    y = p
+    for n in range(kinds.size):
+        if not are_within(MOST_NUMBER, y, size_of(kinds[n]), payload):
             return gt.OUT_OF_BOUNDS
-        c += dim - a
+        if kinds[n] == at.SE3 and not normalize_quaternion(payload, y + 3):
+            return gt.BAD_QUATERNION
+        y += size_of(kinds[n])
+    return gt.GOOD if are_within(MOST_LINEAR, y, p + size - y, payload) else gt.OUT_OF_BOUNDS
+
+
+@part
+def check_information(dim: int, p: int, payload: F64, scratch: F64) -> int:
+    """What is wrong with the information of a new factor, whose upper triangle starts at p; scratch (dim, dim)."""
+    if not are_within(MOST_INFORMATION, p, dim * (dim + 1) // 2, payload):
+        return gt.OUT_OF_BOUNDS
+    if not is_positive_definite(dim, payload, p, scratch):
+        return gt.NOT_POSITIVE_DEFINITE
+    for a in range(dim):
+        if payload[p] < LEAST_INFORMATION:
+            return gt.OUT_OF_BOUNDS
+        p += dim - a
     return gt.GOOD
-
-
-@inline_kernel
-def are_within_kind(kind: int, p: int, size: int, payload: F64) -> bool:
-    """Whether the measurement that starts at p is within bounds; H and b of a linear factor are what R may hold."""
-    if not is_linear(kind):
-        return are_within(MOST_NUMBER, p, size, payload)
-    y = values_of_ends(kind)
-    return are_within(MOST_NUMBER, p, y, payload) and are_within(MOST_LINEAR, p + y, size - y, payload)
 
 
 @part
 def check_measurement(kind: int, p: int, payload: F64) -> int:
-    """What is wrong with a measurement whose numbers are within bounds; directions and quaternions become unit."""
+    """What is wrong with a new measurement that starts at p; directions and quaternions become unit."""
+    if not are_within(MOST_NUMBER, p, information_at(kind), payload):
+        return gt.OUT_OF_BOUNDS
     n = positive_at(kind)
     if n >= 0 and not payload[p + n] > 0.0:
         return gt.BAD_RANGE
@@ -116,7 +117,7 @@ def normalize(v: F64, k: int, size: int, n2: float) -> None:
 @inline_kernel
 def is_positive_definite(n: int, upper: F64, start: int, L: F64) -> bool:
     """Whether the n × n symmetric matrix with this upper triangle (row by row from `start`) is positive definite: its
-    Cholesky factor, made in the (6, 6) scratch `L`, has pivots above rounding."""
+    Cholesky factor, made in the (n, n) scratch `L`, has pivots above rounding."""
     k = start
     for a in range(n):
         for b in range(a, n):

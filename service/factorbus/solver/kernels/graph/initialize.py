@@ -118,7 +118,7 @@ def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F
     two variables.  A mount follows from nothing, and all else from it.
     """
     of, count, missing = base_kind(fac[f, at.F_KIND]), 0, -1
-    if not initializes(of):
+    if of < 0 or not initializes(of):  # a linear factor
         return _NOTHING
     for n in range(count_ends(f, fac)):
         v = end_of(f, n, fac)

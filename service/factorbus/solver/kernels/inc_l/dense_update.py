@@ -129,11 +129,11 @@ def add_omega(f0: int, f1: int, reached: I64, start: I64, graph: Graph, place: I
 
 @part
 def add_many_omega(f: int, reached: I64, start: I64, graph: Graph, place: I64, M: F64, z: F64) -> None:
-    """The same of one factor of more than two variables, which begins at row f."""
+    """The same of one factor that `many` evaluates, which begins at row f."""
     var, fac = graph.var, graph.fac
     _, many = linearize_many(f, var, fac, graph.values, graph.payload)
-    r, J, W, columns = many
-    dim, width = len(W), columns[columns.size - 1]
+    r, J, columns = many
+    dim, width = len(J), columns[columns.size - 1]
     into = np.full(width, -1)  # of each column of J
     for n in range(columns.size - 1):
         column = var[end_of(f, n, fac), at.V_COLUMN]
@@ -147,13 +147,10 @@ def add_many_omega(f: int, reached: I64, start: I64, graph: Graph, place: I64, M
         if into[c] < 0:
             continue
         for a in range(dim):
-            along = 0.0
-            for b in range(dim):
-                along += W[a, b] * J[b, c]
-            z[into[c]] -= along * r[a]
+            z[into[c]] -= J[a, c] * r[a]
             for e in range(width):
                 if 0 <= into[e] <= into[c]:
-                    M[into[e], into[c]] += J[a, e] * along
+                    M[into[e], into[c]] += J[a, e] * J[a, c]
 
 
 @part

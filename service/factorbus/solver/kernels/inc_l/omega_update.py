@@ -19,9 +19,16 @@ from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, zero
 from factorbus.solver.kernels.jit.sorting import sort
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many
+from factorbus.solver.kernels.model.factor_rows import (
+    count_ends,
+    end_of,
+    is_member,
+    is_one_of_many,
+    residual_size,
+    rows_of,
+)
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
-from factorbus.solver.kernels.model.many import linearize_many
+from factorbus.solver.kernels.model.many import Many, linearize_many, upper_factor, width_of
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
@@ -35,6 +42,14 @@ class WhitenedRows(NamedTuple):
     W: F64
     ld: int
     rhs: F64
+
+
+class Cut(NamedTuple):
+    """The rows `begin` to `end` of a factor, which go to W from its row `to` on."""
+
+    begin: int
+    end: int
+    to: int
 
 
 class Remaining(NamedTuple):
@@ -69,9 +84,15 @@ def omega_update(f0: int, f1: int, graph_table: I64, rows_table: I64, ld: int, W
     r, H = scratch.r, scratch.H
     f = f0
     while f < f1:
+        if residual_size(f, fac) > MOST_ROWS:
+            failed = fold_tall(f, graph, rows, whitened, spare)
+            if failed >= 0:
+                return failed
+            f += rows_of(f, fac)
+            continue
         last, height = f, 0
-        while last < f1 and height + residual_dim(fac[last, at.F_KIND]) <= MOST_ROWS:
-            height += residual_dim(fac[last, at.F_KIND])
+        while last < f1 and height + residual_size(last, fac) <= MOST_ROWS:
+            height += residual_size(last, fac)
             last += 1
         count = list_ends(f, last, graph, rows.place, union)
         width = 0
@@ -82,7 +103,10 @@ def omega_update(f0: int, f1: int, graph_table: I64, rows_table: I64, ld: int, W
         k = 0
         for g in range(f, last):
             if is_one_of_many(g, fac):
-                k = whiten_many(g, k, graph, rows, union, whitened)
+                if not is_member(g, fac):
+                    _, many = linearize_many(g, graph.var, fac, graph.values, graph.payload)
+                    cut = Cut(0, len(many.J), k)
+                    k = write_rows(g, cut, many, graph, rows, union, whitened)
                 continue
             evaluate_apart(g, graph.var, fac, graph.values, graph.payload, r, H[0], H[1])
             k = whiten(g, k, graph, rows, union, scratch, whitened)
@@ -150,50 +174,48 @@ def whiten(f: int, k: int, graph: Graph, rows: BlockRows, union: I64, scratch: S
 
 
 @part
-def whiten_many(f: int, k: int, graph: Graph, rows: BlockRows, union: I64, whitened: WhitenedRows) -> int:
-    """`whiten` of a factor of more than two variables; of a row that is not its first nothing."""
-    var, fac, place, rec, ld = graph.var, graph.fac, rows.place, rows.rec, whitened.ld
-    if is_member(f, fac):
-        return k
-    _, many = linearize_many(f, var, fac, graph.values, graph.payload)
-    kind, dim = fac[f, at.F_KIND], len(many.W)
-    upper_factor(dim, fac[f, at.F_AT] + information_at(kind), graph.payload, many.W)
-    for a in range(dim):
-        total = 0.0
-        for b in range(a, dim):
-            total += many.W[a, b] * many.r[b]
-        whitened.rhs[k + a] = -total
-    for n in range(count_ends(f, fac)):
-        column = var[end_of(f, n, fac), at.V_COLUMN]
+def fold_tall(f: int, graph: Graph, rows: BlockRows, whitened: WhitenedRows, spare: I64) -> int:
+    """Fold in the factor that begins at row f and has more rows than W, MOST_ROWS after MOST_ROWS of them.
+
+    Gives −1, or a position whose pivot is not a positive number.
+    """
+    union = np.empty(spare.size, np.int64)
+    _, many = linearize_many(f, graph.var, graph.fac, graph.values, graph.payload)
+    for begin in range(0, len(many.J), MOST_ROWS):
+        end = min(begin + MOST_ROWS, len(many.J))
+        count, width = list_ends(f, f + 1, graph, rows.place, union), 0
+        for e in range(count):
+            width += rows.rec[union[e], br.DIM]
+        for k in range(end - begin):
+            zero(whitened.W, k * whitened.ld, width)
+        write_rows(f, Cut(begin, end, 0), many, graph, rows, union, whitened)
+        failed = sweep(end - begin, Remaining(0, count, 0, width), union, spare, whitened, rows)
+        if failed >= 0:
+            return failed
+    return -1
+
+
+@part
+def write_rows(
+    f: int, cut: Cut, many: Many, graph: Graph, rows: BlockRows, union: I64, whitened: WhitenedRows
+) -> int:  # fmt: skip
+    """Write rows of J and −r of the factor that begins at row f to W; gives the row of W behind them."""
+    place, rec, ld, k = rows.place, rows.rec, whitened.ld, cut.to - cut.begin
+    for a in range(cut.begin, cut.end):
+        whitened.rhs[k + a] = -many.r[a]
+    for n in range(many.start.size - 1):
+        column = graph.var[end_of(f, n, graph.fac), at.V_COLUMN]
         if column < 0:
             continue
         offset, e = 0, 0
         while union[e] != place[column]:
             offset += rec[union[e], br.DIM]
             e += 1
-        for a in range(dim):
-            for c in range(many.start[n], many.start[n + 1]):
-                total = 0.0
-                for b in range(a, dim):
-                    total += many.W[a, b] * many.J[b, c]
-                put(whitened.W, (k + a) * ld + offset + c - many.start[n], total)
-    return k + dim
-
-
-@inline_kernel
-def upper_factor(dim: int, p: int, payload: F64, C: F64) -> None:
-    """C upper triangular with CᵀC the matrix whose upper triangle starts at payload[p]."""
-    for a in range(dim):
-        for b in range(a, dim):
-            C[a, b] = payload[p]
-            p += 1
-    for a in range(dim):
-        for q in range(a):
-            for b in range(a, dim):
-                C[a, b] -= C[q, a] * C[q, b]
-        pivot = 1.0 / math.sqrt(C[a, a])
-        for b in range(a, dim):
-            C[a, b] *= pivot
+        for a in range(cut.begin, cut.end):
+            to = (k + a) * ld + offset
+            for c in range(width_of(n, many)):
+                put(whitened.W, to + c, many.J[a, many.start[n] + c])
+    return k + cut.end
 
 
 @part

@@ -5,8 +5,9 @@ docs/decisions/0001-number-bounds.md says why these.
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import information_start, is_member, residual_size
 from factorbus.solver.kernels.model.records import graph_at
-from factorbus.solver.kernels.model.sizes import information_at, residual_dim, size_of
+from factorbus.solver.kernels.model.sizes import size_of
 
 # Of every number of a value or a measurement: metres, radians, pixels, 1/metre.
 MOST_NUMBER = 1e12
@@ -66,11 +67,11 @@ def are_usual(v0: int, f0: int, graph_table: I64) -> bool:
         if not are_within(USUAL_NUMBER, var[v, at.V_AT], size_of(var[v, at.V_KIND]), values):
             return False
     for f in range(f0, counts[at.FACTORS]):
-        kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
-        size, dim = information_at(kind), residual_dim(kind)
-        if not are_within(USUAL_NUMBER, p, size, payload):
+        if is_member(f, fac):
+            continue
+        p, dim = information_start(f, var, fac), residual_size(f, fac)
+        if not are_within(USUAL_NUMBER, fac[f, at.F_AT], p - fac[f, at.F_AT], payload):
             return False
-        p += size
         for a in range(dim):
             if not (abs(payload[p]) >= LEAST_USUAL_INFORMATION and abs(payload[p]) <= MOST_USUAL_INFORMATION):
                 return False

@@ -1,9 +1,13 @@
 """Residuals, Jacobians and information of factors as plain arrays: for questions about them.  MATH §3, §10.3."""
 
+import math
+
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import information_start, loss_code
 from factorbus.solver.kernels.model.linearize import evaluate_apart
-from factorbus.solver.kernels.model.many import linearize_many
+from factorbus.solver.kernels.model.losses import loss_of
+from factorbus.solver.kernels.model.many import evaluate_plain
 from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
@@ -32,15 +36,27 @@ def evaluate_factors(picked: I64, graph_table: I64, values: F64, r: F64, A: F64,
 
 @kernel("void(int64, int64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1])")
 def evaluate_many(f: int, graph_table: I64, values: F64, r: F64, J: F64, W: F64) -> None:
-    """The factor of more than two variables that begins at row f, at `values`.
+    """The factor that begins at row f, one that `many` evaluates, at `values`; with a loss r and J are times √w.
 
     out  r (dim,), J (dim, Σ d): its Jacobians side by side, in the order of its variables, W (dim, dim)
     """
     graph = graph_at(graph_table)
-    _, many = linearize_many(f, graph.var, graph.fac, values, graph.payload)
-    for a in range(len(W)):
-        r[a] = many.r[a]
-        for b in range(len(W)):
-            W[a, b] = many.W[a, b]
+    var, fac, payload = graph.var, graph.fac, graph.payload
+    more, many = evaluate_plain(f, var, fac, values, payload)
+    dim, p = len(W), information_start(f, var, fac)
+    own, k = 0.0, p
+    for a in range(dim):
+        for b in range(a, dim):
+            W[a, b] = W[b, a] = payload[k]
+            k += 1
+    for a in range(dim):
+        for b in range(dim):
+            own += many.r[a] * W[a, b] * many.r[b]
+    loss, root = loss_code(f, fac), 1.0
+    if loss != at.NO_LOSS:
+        _, w = loss_of(loss, own + more, payload[k])
+        root = math.sqrt(w)
+    for a in range(dim):
+        r[a] = root * many.r[a]
         for c in range(J.shape[1]):
-            J[a, c] = many.J[a, c]
+            J[a, c] = root * many.J[a, c]

@@ -4,11 +4,14 @@ A factor of n > 2 variables has a row for each pair of them, (0, 1), (0, 2), …
 of that pair in Λ.  So whatever follows from which variables are joined, such as order, fill, and which cliques a
 factor changes, is the same for all factors.  The first row has the kind, the measurement and the loss, and the first
 n − 1 rows name the variables.
+
+Such factors, and linear ones of one or two variables, are evaluated by `many`; their first row says how many variables
+and numbers of a residual they have.
 """
 
-from factorbus.solver.kernels.jit.compile import I64, inline_kernel
+from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.sizes import arity_of
+from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim, size_of
 
 
 @inline_kernel
@@ -19,7 +22,7 @@ def loss_code(f: int, fac: I64) -> int:
 
 @inline_kernel
 def is_one_of_many(f: int, fac: I64) -> bool:
-    """Whether row f is of a factor of more than two variables."""
+    """Whether row f is of a factor that `many` evaluates: of more than two variables, or a linear one."""
     return fac[f, at.F_FLAGS] >> at.OFFSET_SHIFT != 0
 
 
@@ -38,13 +41,36 @@ def head_of(f: int, fac: I64) -> int:
 @inline_kernel
 def rows_of(f: int, fac: I64) -> int:
     """How many rows the factor has that begins at row f."""
-    return max(fac[f, at.F_FLAGS] >> at.ROWS_SHIFT, 1)
+    return rows_of_arity(fac[f, at.F_FLAGS] >> at.ENDS_SHIFT & at.ENDS_MASK)
 
 
 @inline_kernel
 def count_ends(f: int, fac: I64) -> int:
     """How many variables the factor has that begins at row f."""
-    return arity_of(fac[f, at.F_KIND])
+    ends = fac[f, at.F_FLAGS] >> at.ENDS_SHIFT & at.ENDS_MASK
+    if ends == 0:
+        ends = 1 if fac[f, at.F_J] < 0 else 2
+    return ends
+
+
+@inline_kernel
+def residual_size(f: int, fac: I64) -> int:
+    """How many numbers the residual has of the factor that begins at row f; 0 of other rows."""
+    own = fac[f, at.F_FLAGS] >> at.DIM_SHIFT
+    return own if own != 0 else residual_dim(fac[f, at.F_KIND])
+
+
+@part
+def information_start(f: int, var: I64, fac: I64) -> int:
+    """Where in the payload the information begins of the factor that begins at row f, behind its measurement."""
+    start, kind = fac[f, at.F_AT], fac[f, at.F_KIND]
+    if kind != at.LINEAR:
+        return start + information_at(kind)
+    values = scalars = 0
+    for n in range(count_ends(f, fac)):
+        end = var[end_of(f, n, fac), at.V_KIND]
+        values, scalars = values + size_of(end), scalars + dim_of(end)
+    return start + values + residual_size(f, fac) * (scalars + 1)
 
 
 @inline_kernel
@@ -61,5 +87,5 @@ def row_of_pair(f: int, a: int, b: int, ends: int) -> int:
 
 @inline_kernel
 def rows_of_arity(ends: int) -> int:
-    """How many rows a factor of so many variables has."""
+    """How many rows a factor of that number of variables has."""
     return ends * (ends - 1) // 2 if ends > 2 else 1

@@ -18,7 +18,6 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import observation
 from factorbus.solver.kernels.model.dispatch import check_same, dispatcher
-from factorbus.solver.kernels.model.linear import linear, linear_se2
 from factorbus.solver.kernels.model.points import prior_point2, prior_point3
 from factorbus.solver.kernels.model.pose_measurements import attitude_se3, heading_se2, position_se2, position_se3
 from factorbus.solver.kernels.model.range_bearing import (
@@ -49,7 +48,6 @@ class FactorModel:
     initializes:  an end without a value gets one from it (`graph.initialize`)
     rigid:        r is the same where both ends move as one body, and that is made use of (`bayes_tree.rigid_subtrees`)
     bounded:      its linearization error has a closed form, (9.4) to (9.13); of others it is computed, (9.11)
-    linear:       a linear model, (3.26): y of its ends is measured first, and Ω may be negative definite
     lens_at:      where in the measurement the lens is; −1: no camera saw it.  The function of what a camera sees
                   returns what χ² has beside rᵀ Ω r
     positive_at:  where in the measurement a number has to be above zero
@@ -64,7 +62,6 @@ class FactorModel:
     initializes: bool = False
     rigid: bool = False
     bounded: bool = False
-    linear: bool = False
     lens_at: int = -1
     positive_at: int = -1
     quaternions: tuple[int, ...] = ()
@@ -80,17 +77,6 @@ def _usual(residual: Callable[..., Any], equation: str, rigid: bool = False, **m
 def _seen(equation: str, lens_at: int, **more: Any) -> FactorModel:
     """What a camera sees."""
     return FactorModel(observation, equation, of_kinds=True, common=True, lens_at=lens_at, **more)
-
-
-def _linear_model(name: str) -> FactorModel:
-    """What is known of one variable, or of two together."""
-    ends, quaternions, start = FACTOR_KINDS[name].connects, [], 0
-    for end in ends:
-        if end == "se3":
-            quaternions.append(start + 3)
-        start += VARIABLE_KINDS[end].size
-    function = linear_se2 if set(ends) == {"se2"} else linear
-    return FactorModel(function, "MATH (3.26)", of_kinds=True, linear=True, quaternions=tuple(quaternions))
 
 
 # Kinds are looked for in this order.
@@ -117,7 +103,6 @@ FACTOR_MODELS = {
     "range_between_se3": FactorModel(range_between_se3, "MATH (3.34)", rigid=True, positive_at=0),
     "bearing_se2": FactorModel(bearing_se2, "MATH (3.24)", rigid=True),
     "bearing_se3": FactorModel(bearing_se3, "MATH (3.25)", rigid=True, directions=(0,)),
-    **{name: _linear_model(name) for name in FACTOR_KINDS if name.startswith("linear_")},
 }
 FACTOR_MODELS |= {
     name: FactorModel(
@@ -157,8 +142,13 @@ def check_kinds() -> None:
 
 
 check_kinds()
-# The last is in place of a kind's for members of a factor of more than two variables, which are not looked at alone.
-_MODELS = (*(FACTOR_MODELS[name] for name in FACTOR_KINDS), FactorModel(prior_point2, "", bounded=True))
+# The last two are in place of a kind's for linear factors, which `many` evaluates, and for members of a factor of more
+# than two variables, which are not looked at alone.
+_MODELS = (
+    *(FACTOR_MODELS[name] for name in FACTOR_KINDS),
+    FactorModel(prior_point2, "MATH (3.26)"),
+    FactorModel(prior_point2, "", bounded=True),
+)
 
 
 def _table(values: Any) -> I64:
@@ -177,14 +167,11 @@ _LENS_AT = _table(model.lens_at for model in _MODELS)
 _POSITIVE_AT = _table(model.positive_at for model in _MODELS)
 _QUATERNIONS = _starts(model.quaternions for model in _MODELS)
 _DIRECTIONS = _starts(model.directions for model in _MODELS)
-_CHECKED = (_POSITIVE_AT >= 0) | (_QUATERNIONS[:, 0] >= 0) | (_DIRECTIONS[:, 0] >= 0)
 # For Python, which asks for many factors at once: by the code of a kind.
-LINEAR = np.array([model.linear for model in _MODELS])
-LINEAR_OF_ONE = LINEAR & np.array([*(len(kind.connects) == 1 for kind in FACTOR_KINDS.values()), False])
 CAMERA = _LENS_AT >= 0
 BOUNDED = np.array([model.bounded for model in _MODELS])
 POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])  # by the code of a kind of variables
-SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False])
+SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False, False])
 _BASE = _table(at.FACTOR_CODES[model.base] if model.base else -1 for model in _MODELS)
 
 
@@ -207,12 +194,6 @@ def lens_at(kind: int) -> int:
 
 
 @inline_kernel
-def is_linear(kind: int) -> bool:
-    """Whether it is a linear model of its variables."""
-    return LINEAR[kind]
-
-
-@inline_kernel
 def initializes(kind: int) -> bool:
     """Whether it gives a value to an end that has none."""
     return _INITIALIZES[kind]
@@ -228,12 +209,6 @@ def is_rigid(kind: int) -> bool:
 def is_bounded(kind: int) -> bool:
     """Whether a closed form bounds its linearization error."""
     return BOUNDED[kind]
-
-
-@inline_kernel
-def is_checked(kind: int) -> bool:
-    """Whether its measurement has to be more than within bounds: positive, a quaternion, a direction."""
-    return _CHECKED[kind]
 
 
 @inline_kernel

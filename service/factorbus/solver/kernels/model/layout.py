@@ -29,7 +29,8 @@ F_WIDTH = 8
 SWAPPED = 1  # the block of the pair stands as (j, i), because column j comes first
 LOSS_SHIFT, LOSS_MASK = 8, 0xFF  # the code of its loss
 OFFSET_SHIFT, OFFSET_MASK = 16, 0xFFFF  # of a member: how many rows before it the factor begins
-ROWS_SHIFT = 32  # of a factor of more variables than two: how many rows it has; else 0
+ENDS_SHIFT, ENDS_MASK = 32, 0xFFFF  # of a factor of any number of variables (`many`): how many; of others 0
+DIM_SHIFT = 48  # of the same: how many numbers its residual has
 
 # Entries of `counts`.
 VARIABLES = 0
@@ -54,8 +55,10 @@ POINT2 = VARIABLE_CODES["point2"]
 POINT3 = VARIABLE_CODES["point3"]
 IDP = VARIABLE_CODES["idp"]
 
+# The kind of all linear factors, whose rows and variables are their own.
+LINEAR = len(FACTOR_KINDS)
 # In place of a kind: the row is of a pair of a factor that begins before it.
-MEMBER = len(FACTOR_KINDS)
+MEMBER = LINEAR + 1
 
 PRIOR_SE2 = FACTOR_CODES["prior_se2"]
 PRIOR_SE3 = FACTOR_CODES["prior_se3"]
@@ -75,10 +78,6 @@ HEADING_SE2 = FACTOR_CODES["heading_se2"]
 ATTITUDE_SE3 = FACTOR_CODES["attitude_se3"]
 BEARING_SE2 = FACTOR_CODES["bearing_se2"]
 BEARING_SE3 = FACTOR_CODES["bearing_se3"]
-LINEAR_SE2 = FACTOR_CODES["linear_se2"]
-LINEAR_SE3 = FACTOR_CODES["linear_se3"]
-LINEAR_PAIR_SE2 = FACTOR_CODES["linear_pair_se2"]
-LINEAR_PAIR_SE3 = FACTOR_CODES["linear_pair_se3"]
 
 # Codes of losses; 0: none.
 NO_LOSS = 0

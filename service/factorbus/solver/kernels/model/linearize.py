@@ -100,15 +100,10 @@ def add_other(kind: int, row: I64, var: I64, info: F64, scratch: Scratch, system
 
 @part
 def add_many(f: int, var: I64, fac: I64, values: F64, payload: F64, system: NormalEquations) -> float:
-    """Add the blocks and the gradient of the factor of more than two variables that begins at row f; gives its χ²."""
+    """Add the blocks and the gradient of the factor that begins at row f; gives its χ²."""
     more, many = linearize_many(f, var, fac, values, payload)
-    r, J, W, start = many
-    dim, ends, data = len(W), start.size - 1, system.data
-    WJ = np.zeros(J.shape)
-    for a in range(dim):
-        for b in range(dim):
-            for c in range(start[ends]):
-                WJ[a, c] += W[a, b] * J[b, c]
+    r, J, start = many
+    dim, ends, data = len(J), start.size - 1, system.data
     for n in range(ends):
         v, d = end_of(f, n, fac), start[n + 1] - start[n]
         if var[v, at.V_COLUMN] < 0:
@@ -117,12 +112,12 @@ def add_many(f: int, var: I64, fac: I64, values: F64, payload: F64, system: Norm
         for i in range(d):
             total = 0.0
             for a in range(dim):
-                total += WJ[a, start[n] + i] * r[a]
+                total += J[a, start[n] + i] * r[a]
             system.eta[scalar + i] -= total
             for j in range(i, d):
                 total = 0.0
                 for a in range(dim):
-                    total += J[a, start[n] + i] * WJ[a, start[n] + j]
+                    total += J[a, start[n] + i] * J[a, start[n] + j]
                 data[block + i * d + j] += total
                 if j > i:
                     data[block + j * d + i] = data[block + i * d + j]
@@ -135,7 +130,7 @@ def add_many(f: int, var: I64, fac: I64, values: F64, payload: F64, system: Norm
                 for j in range(e):
                     total = 0.0
                     for a in range(dim):
-                        total += J[a, start[n] + i] * WJ[a, start[m] + j]
+                        total += J[a, start[n] + i] * J[a, start[m] + j]
                     data[block + (j * d + i if fac[row, at.F_FLAGS] & at.SWAPPED else i * e + j)] += total
     return more + square_of(many)
 

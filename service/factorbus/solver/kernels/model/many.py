@@ -1,7 +1,8 @@
-"""Factors of more than two variables: residual, Jacobians and loss.  MATH §3.9.
+"""Factors of any number of variables: residual, Jacobians and loss.  MATH §3.6, §3.8.
 
-Their Jacobians stand side by side in J, in the order of the variables, each as wide as its variable has scalars.  All
-of them are kinds of a sensor whose mount m on the robot is estimated: the residual of another kind with the sensor's
+Their Jacobians stand side by side in J, in the order of the variables, each as wide as its variable has scalars; r and
+J are times C with CᵀC = Ω, so that Ω is one from here on.  One kind is the linear model (3.26), of any variables.  The
+others are kinds of a sensor whose mount m on the robot is estimated: the residual of another kind with the sensor's
 pose c = a ∘ m in place of the robot's pose a.  With A = ∂r/∂c, and Ad(m⁻¹) what a displacement of a is of c,
 
     ∂r/∂a = A Ad(m⁻¹),   ∂r/∂m = A,   Ad(m⁻¹) = [ R_mᵀ | −R_mᵀ ⌊t_m⌋ ; 0 | R_mᵀ ]                        (3.35)
@@ -16,87 +17,141 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, loss_code
+from factorbus.solver.kernels.model.factor_rows import (
+    count_ends,
+    end_of,
+    information_start,
+    loss_code,
+    residual_size,
+)
 from factorbus.solver.kernels.model.kinds import base_kind, residual_of
+from factorbus.solver.kernels.model.linear import linear
 from factorbus.solver.kernels.model.losses import loss_of
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import compose_se2
 from factorbus.solver.kernels.model.se3 import compose_se3, rotation_matrix
-from factorbus.solver.kernels.model.sizes import dim_of, information_at, kind_of_end, residual_dim, scale_at
+from factorbus.solver.kernels.model.sizes import dim_of, kind_of_end, residual_dim
 
 POSE = 7  # numbers of a pose, at most
 FIRST, SECOND, MOUNT = range(3)  # the variables of what a sensor measures
 
 
 class Many(NamedTuple):
-    """A factor of more than two variables, linearized: r (dim or R_SIZE,), J (dim, Σ d), information W (dim, dim);
-    start (ends + 1,): the first column of each variable."""
+    """A factor linearized: r (dim or R_SIZE,), J (dim, Σ d); start (ends + 1,): the first column of each variable."""
 
     r: F64
     J: F64
-    W: F64
     start: I64
 
 
 @part
 def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
-    """The factor that begins at row f at the values x, with its loss; what χ² has beside rᵀ Ω r."""
-    kind, ends = fac[f, at.F_KIND], count_ends(f, fac)
-    dim, start, k = residual_dim(kind), np.zeros(ends + 1, np.int64), fac[f, at.F_AT] + information_at(kind)
-    for n in range(ends):
-        start[n + 1] = start[n] + dim_of(var[end_of(f, n, fac), at.V_KIND])
-    many = Many(np.zeros(max(dim, at.R_SIZE)), np.zeros((dim, start[ends])), np.empty((dim, dim)), start)
-    for a in range(dim):
-        for b in range(a, dim):
-            many.W[a, b] = many.W[b, a] = payload[k]
-            k += 1
-    places = np.empty(ends, np.int64)
-    for n in range(ends):
-        places[n] = var[end_of(f, n, fac), at.V_AT]
-    more = at_mount(kind, x, places, payload, fac[f, at.F_AT], many)
+    """The factor that begins at row f at the values x, whitened and with its loss; what χ² has beside rᵀ r."""
+    more, many = evaluate_plain(f, var, fac, x, payload)
+    dim, start = len(many.J), information_start(f, var, fac)
+    whiten(dim, start, payload, many)
     loss = loss_code(f, fac)
     if loss != at.NO_LOSS:
-        more = soften_many(loss, payload[fac[f, at.F_AT] + scale_at(kind)], more, many)
+        more = soften_many(loss, payload[start + dim * (dim + 1) // 2], more, many)
     return more, many
+
+
+@part
+def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
+    """Residual and Jacobians of the factor that begins at row f; what χ² has beside rᵀ Ω r."""
+    kind, ends, dim, more = fac[f, at.F_KIND], count_ends(f, fac), residual_size(f, fac), 0.0
+    start, kinds, places = np.zeros(ends + 1, np.int64), np.empty(ends, np.int64), np.empty(ends, np.int64)
+    for n in range(ends):
+        v = end_of(f, n, fac)
+        kinds[n], places[n] = var[v, at.V_KIND], var[v, at.V_AT]
+        start[n + 1] = start[n] + dim_of(kinds[n])
+    many = Many(np.zeros(max(dim, at.R_SIZE)), np.zeros((dim, start[ends])), start)
+    if kind == at.LINEAR:
+        linear(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
+    else:
+        more = at_mount(kind, x, places, payload, fac[f, at.F_AT], many)
+    return more, many
+
+
+@part
+def whiten(dim: int, p: int, payload: F64, many: Many) -> None:
+    """r and J times C, upper triangular, with CᵀC = Ω, whose upper triangle begins at payload[p]."""
+    r, J, k, is_diagonal = many.r, many.J, p, True
+    for a in range(dim):
+        for b in range(1, dim - a):
+            is_diagonal &= payload[k + b] == 0.0
+        k += dim - a
+    if is_diagonal:
+        k = p
+        for a in range(dim):
+            root = math.sqrt(payload[k])
+            if root != 1.0:
+                r[a] *= root
+                for c in range(J.shape[1]):
+                    J[a, c] *= root
+            k += dim - a
+        return
+    C = np.empty((dim, dim))
+    upper_factor(dim, p, payload, C)
+    for a in range(dim):
+        r[a] *= C[a, a]
+        for c in range(J.shape[1]):
+            J[a, c] *= C[a, a]
+        for b in range(a + 1, dim):
+            r[a] += C[a, b] * r[b]
+            for c in range(J.shape[1]):
+                J[a, c] += C[a, b] * J[b, c]
+
+
+@inline_kernel
+def upper_factor(dim: int, p: int, payload: F64, C: F64) -> None:
+    """C upper triangular with CᵀC the matrix whose upper triangle starts at payload[p]."""
+    for a in range(dim):
+        for b in range(a, dim):
+            C[a, b] = payload[p]
+            p += 1
+    for a in range(dim):
+        for q in range(a):
+            for b in range(a, dim):
+                C[a, b] -= C[q, a] * C[q, b]
+        pivot = 1.0 / math.sqrt(C[a, a])
+        for b in range(a, dim):
+            C[a, b] *= pivot
 
 
 @inline_kernel
 def width_of(n: int, many: Many) -> int:
-    """Scalars of the n-th variable."""
-    return many.start[n + 1] - many.start[n]
+    """Scalars of the n-th variable; 0 where there is none."""
+    return many.start[n + 1] - many.start[n] if n + 1 < many.start.size else 0
 
 
 @inline_kernel
 def square_of(many: Many) -> float:
-    """rᵀ Ω r"""
-    total, dim = 0.0, len(many.W)
-    for a in range(dim):
-        for b in range(dim):
-            total += many.r[a] * many.W[a, b] * many.r[b]
+    """rᵀ r, of what is whitened."""
+    total = 0.0
+    for a in range(len(many.J)):
+        total += many.r[a] * many.r[a]
     return total
 
 
 @part
 def add_normal_equations(n: int, many: Many, M: F64, z: F64) -> None:
-    """M += J_nᵀ Ω J_n, on and above the diagonal, and z −= J_nᵀ Ω r, of the n-th variable."""
-    first, dim = many.start[n], len(many.W)
-    for c in range(many.start[n + 1] - first):
-        for a in range(dim):
-            along = 0.0
-            for b in range(dim):
-                along += many.W[a, b] * many.J[b, first + c]
-            z[c] -= along * many.r[a]
+    """M += J_nᵀ J_n, on and above the diagonal, and z −= J_nᵀ r, of the n-th variable."""
+    first = many.start[n]
+    for a in range(len(many.J)):
+        for c in range(many.start[n + 1] - first):
+            z[c] -= many.J[a, first + c] * many.r[a]
             for e in range(c + 1):
-                M[e, c] += many.J[a, first + e] * along
+                M[e, c] += many.J[a, first + e] * many.J[a, first + c]
 
 
 @part
 def soften_many(loss: int, scale: float, more: float, many: Many) -> float:
-    """As `losses.soften`."""
+    """As `losses.soften`, of what is whitened."""
     own = square_of(many)
     rho, w = loss_of(loss, own + more, scale)
     root = math.sqrt(w)
-    for a in range(len(many.W)):
+    for a in range(len(many.J)):
         many.r[a] *= root
         for c in range(many.J.shape[1]):
             many.J[a, c] *= root

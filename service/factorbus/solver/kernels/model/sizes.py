@@ -10,18 +10,17 @@ from factorbus.solver.kernels.jit.compile import inline_kernel
 from factorbus.solver.kernels.model import layout as at
 
 _FACTORS, _VARIABLES = tuple(FACTOR_KINDS.values()), tuple(VARIABLE_KINDS.values())
-MOST_ENDS = 16
+MOST_ENDS = 3  # of a kind with a fixed number of variables
 _SIZE = np.array([kind.size for kind in _VARIABLES], np.int64)
 _DIM = np.array([kind.dim for kind in _VARIABLES], np.int64)
-# By the code of a kind of factor, and last of all of what is a member of a factor of more variables.
-_RESIDUAL_DIM = np.array([*(kind.dim for kind in _FACTORS), 0], np.int64)
-_MEASURED = np.array([*(kind.size for kind in _FACTORS), 0], np.int64)
-_ARITY = np.array([*(len(kind.connects) for kind in _FACTORS), 2], np.int64)
-_ENDS = np.full((len(_FACTORS) + 1, MOST_ENDS), -1, np.int64)
+# By the code of a kind of factor; the last two are of linear factors, whose sizes are their own, and of members.
+_RESIDUAL_DIM = np.array([*(kind.dim for kind in _FACTORS), 0, 0], np.int64)
+_MEASURED = np.array([*(kind.size for kind in _FACTORS), 0, 0], np.int64)
+_ARITY = np.array([*(len(kind.connects) for kind in _FACTORS), 0, 2], np.int64)
+_ENDS = np.full((len(_FACTORS) + 2, MOST_ENDS), -1, np.int64)
 for _row, _kind in enumerate(_FACTORS):
     _ENDS[_row, : len(_kind.connects)] = [at.VARIABLE_CODES[end] for end in _kind.connects]
 _END_DIMS = np.where(_ENDS >= 0, _DIM[_ENDS], 0)
-_LINEARIZED = np.where(_ENDS >= 0, _SIZE[_ENDS], 0).sum(axis=1)
 
 
 @inline_kernel
@@ -77,9 +76,3 @@ def kinds_of_ends(kind: int) -> tuple:
 def end_dims(kind: int) -> tuple:
     """Scalars in the tangents of the first two ends of a kind of factor; 0: no second one."""
     return _END_DIMS[kind, 0], _END_DIMS[kind, 1]
-
-
-@inline_kernel
-def values_of_ends(kind: int) -> int:
-    """Numbers of the values of the ends of a kind of factor together."""
-    return _LINEARIZED[kind]
