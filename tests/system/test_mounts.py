@@ -73,6 +73,11 @@ def test_a_mount_is_found_and_asked_about_and_there_after_a_kill(spawn: Callable
             saved = saved_as(tmp_path / name, endpoint)
             assert ("1 mount left out" in saved) == (name == "map.g2o")
         assert len((tmp_path / "way.tum").read_text().splitlines()) == 40
+        late = Draft().se2("m1", ROUGH).prior_se2("m1", ROUGH, sigmas=(1, 1, 1))
+        done.append((late, robot.insert(late.landmark_se2("x39", "l0", (1, 1), mount="m1", sigmas=(9, 9)))))
+        robot.settle()
+        (last,) = robot.uncertainty.last().groups
+        assert last.keys.tolist() == [symbol("x", 39)], "the newest pose, and not the mount that came after it"
         sigma = np.sqrt(np.diag(robot.uncertainty.joint("m0")))
         off = robot.estimate["m0"] - MOUNT
         assert (np.abs(off) < 3 * sigma).all()
@@ -99,7 +104,7 @@ def test_a_mount_is_found_and_asked_about_and_there_after_a_kill(spawn: Callable
         assert "l1" in str(refused.value)
         robot.wait_converged()
         last, graph = robot.ask_estimate(), robot.graph()
-    assert len(done) == 40
+    assert len(done) == 41
     service.signal(signal.SIGKILL)
     service.wait()
     again = spawn(*serve)
