@@ -25,14 +25,15 @@ from factorbus.solver.kernels.model.factor_rows import (
     is_member,
     is_one_of_many,
     residual_size,
-    rows_of,
 )
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
 from factorbus.solver.kernels.model.many import Many, linearize_many, upper_factor, width_of
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
-MOST_ROWS = 48  # of W at a time
+# Of W at a time.  A step of this kind has at most 24 rows of `fac` (`inc_l.strategy`), so none of its factors has more
+# than seven variables, and 43 rows.
+MOST_ROWS = 48
 _STRIP = 96  # columns that are worked on together: with MOST_ROWS rows they fit the first level cache
 
 
@@ -42,14 +43,6 @@ class WhitenedRows(NamedTuple):
     W: F64
     ld: int
     rhs: F64
-
-
-class Cut(NamedTuple):
-    """The rows `begin` to `end` of a factor, which go to W from its row `to` on."""
-
-    begin: int
-    end: int
-    to: int
 
 
 class Remaining(NamedTuple):
@@ -84,12 +77,6 @@ def omega_update(f0: int, f1: int, graph_table: I64, rows_table: I64, ld: int, W
     r, H = scratch.r, scratch.H
     f = f0
     while f < f1:
-        if residual_size(f, fac) > MOST_ROWS:
-            failed = fold_tall(f, graph, rows, whitened, spare)
-            if failed >= 0:
-                return failed
-            f += rows_of(f, fac)
-            continue
         last, height = f, 0
         while last < f1 and height + residual_size(last, fac) <= MOST_ROWS:
             height += residual_size(last, fac)
@@ -105,8 +92,7 @@ def omega_update(f0: int, f1: int, graph_table: I64, rows_table: I64, ld: int, W
             if is_one_of_many(g, fac):
                 if not is_member(g, fac):
                     _, many = linearize_many(g, graph.var, fac, graph.values, graph.payload)
-                    cut = Cut(0, len(many.J), k)
-                    k = write_rows(g, cut, many, graph, rows, union, whitened)
+                    k = write_rows(g, k, many, graph, rows, union, whitened)
                 continue
             evaluate_apart(g, graph.var, fac, graph.values, graph.payload, r, H[0], H[1])
             k = whiten(g, k, graph, rows, union, scratch, whitened)
@@ -174,34 +160,12 @@ def whiten(f: int, k: int, graph: Graph, rows: BlockRows, union: I64, scratch: S
 
 
 @part
-def fold_tall(f: int, graph: Graph, rows: BlockRows, whitened: WhitenedRows, spare: I64) -> int:
-    """Fold in the factor that begins at row f and has more rows than W, MOST_ROWS after MOST_ROWS of them.
-
-    Gives −1, or a position whose pivot is not a positive number.
-    """
-    union = np.empty(spare.size, np.int64)
-    _, many = linearize_many(f, graph.var, graph.fac, graph.values, graph.payload)
-    for begin in range(0, len(many.J), MOST_ROWS):
-        end = min(begin + MOST_ROWS, len(many.J))
-        count, width = list_ends(f, f + 1, graph, rows.place, union), 0
-        for e in range(count):
-            width += rows.rec[union[e], br.DIM]
-        for k in range(end - begin):
-            zero(whitened.W, k * whitened.ld, width)
-        write_rows(f, Cut(begin, end, 0), many, graph, rows, union, whitened)
-        failed = sweep(end - begin, Remaining(0, count, 0, width), union, spare, whitened, rows)
-        if failed >= 0:
-            return failed
-    return -1
-
-
-@part
 def write_rows(
-    f: int, cut: Cut, many: Many, graph: Graph, rows: BlockRows, union: I64, whitened: WhitenedRows
+    f: int, k: int, many: Many, graph: Graph, rows: BlockRows, union: I64, whitened: WhitenedRows
 ) -> int:  # fmt: skip
-    """Write rows of J and −r of the factor that begins at row f to W; gives the row of W behind them."""
-    place, rec, ld, k = rows.place, rows.rec, whitened.ld, cut.to - cut.begin
-    for a in range(cut.begin, cut.end):
+    """Write J and −r of the factor that begins at row f from row k of W on; gives the row of W behind them."""
+    place, rec, ld, dim = rows.place, rows.rec, whitened.ld, len(many.J)
+    for a in range(dim):
         whitened.rhs[k + a] = -many.r[a]
     for n in range(many.start.size - 1):
         column = graph.var[end_of(f, n, graph.fac), at.V_COLUMN]
@@ -211,11 +175,11 @@ def write_rows(
         while union[e] != place[column]:
             offset += rec[union[e], br.DIM]
             e += 1
-        for a in range(cut.begin, cut.end):
+        for a in range(dim):
             to = (k + a) * ld + offset
             for c in range(width_of(n, many)):
                 put(whitened.W, to + c, many.J[a, many.start[n] + c])
-    return k + cut.end
+    return k + dim
 
 
 @part
