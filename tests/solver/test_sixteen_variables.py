@@ -111,3 +111,32 @@ def test_what_is_left_when_some_are_marginalized_is_what_it_was(space: str, rows
     blocks = CovarianceBlocks(after.covariances.factored())
     together = blocks.joint(np.array([index[key] for key in left]))
     np.testing.assert_allclose(together, known.joint(left), rtol=0, atol=1e-8 * np.abs(together).max())
+
+
+@pytest.mark.parametrize("joined", [3, 7])
+def test_an_omega_update_takes_the_largest_factors_that_it_is_chosen_for(joined: int) -> None:
+    """More rows than variables have scalars are never sent, and with more pairs of variables it is not chosen."""
+    rng, keys = np.random.default_rng(2), KEYS[:12]
+    truth = {key: random_value("se3", rng) for key in keys}
+    often = {"small_loop_threshold": 10**6, "big_loop_threshold": 10**6, "loop_threshold_share": 1e6}
+    solver, twin = Solver(Options.of(mode="inc-l", **often)), DenseGraph()
+    steps = []
+    for n, key in enumerate(keys):
+        some = [key] if n == 0 else [keys[n - 1], key]
+        kind = linear_kind(6, ("se3",) * len(some))
+        z = random_other(kind.name, [truth[k] for k in some], 0.01, rng)
+        factor = Factors(kind.name, np.array([some]), z[None], random_information(6, rng)[None])
+        steps.append(Batch((Variables("se3", np.array([key]), truth[key][None]),), (factor,)))
+    kind, some = linear_kind(6 * joined + 1, ("se3",) * joined), rng.permutation(keys)[:joined].tolist()
+    z = random_other(kind.name, [truth[key] for key in some], 0.01, rng)
+    loop = Factors(kind.name, np.array([some]), z[None], random_information(kind.dim, rng)[None])
+    for batch in [*steps, Batch((), (loop,))]:
+        solver.stage(batch)
+        report = solver.step()
+        twin.add(batch)
+        twin.put(solver.estimate())
+    assert report.strategy == "omega"
+    assert report.chi2 == pytest.approx(twin.chi2(), rel=1e-9)
+    solver.step(settle=True)
+    twin.put(solver.estimate())
+    assert twin.gauss_newton(iterations=1) < 1e-7
