@@ -13,6 +13,7 @@ that lead to them, are made in `kitchen.py`: their numbers are those of a stated
 import json
 import runpy
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -180,12 +181,13 @@ def _one_of(kind: FactorKind) -> Batch:
 def _linear_kinds() -> Batch:
     """Linear factors of one variable, of two, and of more, with few rows and with many."""
     plane, space = (symbol("x", 1), symbol("l", 1)), (symbol("y", 1), symbol("p", 1), symbol("f", 1))
-    of = {"se2": plane[0], "point2": plane[1], "se3": space[0], "point3": space[1], "idp": space[2]}
+    of = {"se2": plane[0], "point2": plane[1], "se3": space[0], "point3": space[1], "idp": space[2],
+          "vector1": symbol("v", 1), "vector3": symbol("v", 3)}  # fmt: skip
     groups = []
     for rows, ends in (
         (2, ("point2",)), (3, ("point3",)), (6, ("idp",)), (2, ("point2", "point2")), (2, ("se2", "point2")),
         (3, ("se3", "point3")), (6, ("se3", "idp")), (4, ("point3", "idp")), (9, ("se2", "point2", "se2")),
-        (1, ("point3", "se3", "se3", "idp")),
+        (1, ("point3", "se3", "se3", "idp")), (3, ("se3", "vector3", "vector1")),
     ):  # fmt: skip
         kind = linear_kind(rows, ends)
         keys = np.array([[of[end] + ends[:n].count(end) for n, end in enumerate(ends)]])
@@ -195,7 +197,13 @@ def _linear_kinds() -> Batch:
                 numbers[here + 3 : here + 7] = 0.0, 0.0, 0.6, 0.8
             here += VARIABLE_KINDS[end].size
         groups.append(Factors(kind.name, keys, numbers[None], np.eye(rows)[np.triu_indices(rows)][None]))
-    return Batch(factors=tuple(groups))
+    return Batch(tuple(_vectors()), tuple(groups))
+
+
+def _vectors() -> Iterator[Variables]:
+    """One of each size."""
+    for n in range(1, 10):
+        yield Variables(f"vector{n}", np.array([symbol("v", n)]), np.array([[(k - 4) / 8 for k in range(n)]]))
 
 
 def _mounts() -> Batch:

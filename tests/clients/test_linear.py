@@ -121,7 +121,7 @@ def test_any_rows_of_any_variables_have_the_optimum_of_dense_matrices(seed: int,
 def preintegrated(n: int, at: dict[str, np.ndarray], rng: np.random.Generator) -> Known:
     """As an inertial sensor has it after 0.1 s: rows of position, velocity, attitude, and both biases."""
     names = [f"x{n}", f"v{n}", f"x{n + 1}", f"v{n + 1}", f"a{n}", f"g{n}", f"a{n + 1}", f"g{n + 1}"]
-    kinds = ["se3", "point3", "se3", "point3", "point3", "point3", "point3", "point3"]
+    kinds = ["se3", "vector3", "se3", "vector3", "vector3", "vector3", "vector3", "vector3"]
     known = drawn(names, kinds, [at[name] for name in names], 15, rng, 1e-3)
     one, dt, down = np.eye(3), 0.1, np.array([[0, 9.8, 0], [-9.8, 0, 0], [0, 0, 0]])
     rows_of = (  # of each end: (row, column, block)
@@ -151,7 +151,7 @@ def inertial(count: int, rng: np.random.Generator) -> tuple[dict[str, str], dict
         pose = boxplus("se3", np.array([0.5 * n, 0, 0, 0, 0, 0, 1.0]), 0.1 * rng.normal(size=6))
         at |= {f"x{n}": pose, f"v{n}": np.array([1.0, 0, 0]) + 0.1 * rng.normal(size=3)}
         at |= {f"a{n}": 0.1 * rng.normal(size=3), f"g{n}": 0.1 * rng.normal(size=3)}
-        kinds |= {f"x{n}": "se3", f"v{n}": "point3", f"a{n}": "point3", f"g{n}": "point3"}
+        kinds |= {f"x{n}": "se3", f"v{n}": "vector3", f"a{n}": "vector3", f"g{n}": "vector3"}
     sigmas, held = {"x": 0.01, "v": 0.1, "a": 0.05, "g": 0.005}, []
     for c, sigma in sigmas.items():
         d = TANGENT[kinds[f"{c}0"]]
@@ -162,7 +162,7 @@ def inertial(count: int, rng: np.random.Generator) -> tuple[dict[str, str], dict
 def test_preintegrated_motion_between_states_of_four_variables() -> None:
     rng = np.random.default_rng(5)
     kinds, at, held = inertial(4, rng)
-    held.append(drawn(["x3", "v1"], ["se3", "point3"], [at["x3"], at["v1"]], 9, rng, 0.02))
+    held.append(drawn(["x3", "v1"], ["se3", "vector3"], [at["x3"], at["v1"]], 9, rng, 0.02))
     draft = Draft()
     for name, kind in kinds.items():
         draft.variable(kind, name, at[name])
@@ -239,6 +239,20 @@ def test_it_is_one_factor_as_it_was_said() -> None:
         Draft().linear(["v1"], [point], [np.eye(3)], np.zeros(3), sigmas=(1, 1, 2), kinds=["point3"]).batch().factors
     )
     assert group.kind == "linear_3_point3"
+
+
+def test_the_kinds_of_what_is_in_the_draft_need_not_be_said() -> None:
+    draft = Draft().se3("x1", (0, 0, 0, 0, 0, 0, 1)).vector("v1", (1, 0, 0)).vector("s1", [1.5])
+    H = [np.ones((2, 6)), np.ones((2, 3)), np.ones((2, 1)), np.ones((2, 3))]
+    y = [(0, 0, 0, 0, 0, 0, 1), (1, 0, 0), (1.5,), (4, 5, 6)]
+    (group,) = draft.linear(["x1", "v1", "s1", "l1"], y, H, (0, 0), sigmas=(1, 1)).batch().factors
+    assert group.kind == "linear_2_se3_vector3_vector1_point3"
+    with pytest.raises(Problem) as refused:
+        Draft().linear(["s1"], [(1.5,)], [np.eye(1)], (0,), sigmas=(1,))
+    assert refused.value.code == "bad_shape"
+    assert "kinds=" in str(refused.value)
+    with pytest.raises(Problem):
+        Draft().vector("v1", np.zeros(10))
 
 
 @pytest.mark.parametrize(

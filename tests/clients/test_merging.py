@@ -281,6 +281,33 @@ def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
     assert solver.factor_count == kept.batch.factor_count
 
 
+def test_vectors_stay_as_they_are_and_what_is_known_with_them_goes_along() -> None:
+    """A velocity in the robot's frame, a bias: no frame moves them, and a factor on them says nothing of the map."""
+
+    def more(draft: Draft) -> None:
+        draft.vector("v0", (0.5, 0, 0.25)).vector("b0", (2.0,))
+        draft.linear(["v0"], [(0.5, 0, 0.25)], [np.eye(3)], np.zeros(3), sigmas=(1, 1, 1))
+        rows = [np.eye(3), -np.eye(3), 0.5 * np.eye(3), np.ones((3, 1))]
+        rows[1], ends = -np.eye(3) @ _adjoint_of_one_metre(), ["x1", "x0", "v0", "b0"]
+        draft.linear(ends, [(1, 0, 0), (0, 0, 0), (0.5, 0, 0.25), (2.0,)], rows, np.zeros(3), sigmas=SIGMAS)
+
+    other = there(more)
+    fitted = fit_into(here("x0", "x1"), other, anchors=link(), letters={"x": "y", "v": "w", "b": "c"})
+    values = {g.kind: g.values for g in fitted.batch.variables}
+    np.testing.assert_array_equal(values["vector3"], [[0.5, 0, 0.25]])
+    np.testing.assert_array_equal(values["vector1"], [[2.0]])
+    assert [g.kind for g in fitted.batch.factors if g.kind.startswith("linear")] == [
+        "linear_3_vector3",
+        "linear_3_se2_se2_vector3_vector1",
+    ]
+    assert not fitted.left_out
+
+
+def _adjoint_of_one_metre() -> np.ndarray:
+    """What a displacement of a pose is of the one a metre ahead of it."""
+    return np.array([[1.0, 0, 0], [0, 1, 1], [0, 0, 1]])
+
+
 def test_what_cannot_be_merged_says_why() -> None:
     ours, other = here("x0", "x1"), there()
     for problem, wrong, how in (

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from factorbus.proto.camera import Camera
 
 TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3, "idp": 6}
+TANGENT |= {f"vector{n}": n for n in range(1, 10)}
 
 
 def pose_matrix(x: np.ndarray) -> np.ndarray:
@@ -34,7 +35,7 @@ def pose_vector(T: np.ndarray) -> np.ndarray:
 
 def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
     """x ⊞ δ for a kind of variable."""
-    if kind.startswith("point"):
+    if kind.startswith(("point", "vector")):
         return x + delta
     if kind == "idp":
         moved = x + delta
@@ -112,7 +113,7 @@ def linear_ends(kind: str) -> list[str]:
 
 def boxminus(kind: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """x ⊟ y as linear factors have it."""
-    if kind.startswith("point"):
+    if kind.startswith(("point", "vector")):
         return x - y
     if kind == "idp":
         return np.where(np.arange(6) == 3, np.angle(np.exp(1j * (x - y))), x - y)

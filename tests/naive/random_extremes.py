@@ -11,10 +11,18 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
 MOST, MOST_INFORMATION = 1e12, 1e24
-SIZES = {"se2": 3, "se3": 7, "point2": 2, "point3": 3, "idp": 6}
-ENDS = {"se2": "se2", "se3": "se3", "point2": "point2", "point3": "point3", "idp": "idp"}
+SIZES = {"se2": 3, "se3": 7, "point2": 2, "point3": 3, "idp": 6, "vector1": 1, "vector3": 3, "vector9": 9}
 LOSSES = ("", "", "", "huber", "cauchy", "geman-mcclure", "tukey", "dcs")
-LETTERS = {"se2": "x", "se3": "y", "point2": "l", "point3": "p", "idp": "f"}
+LETTERS = {
+    "se2": "x",
+    "se3": "y",
+    "point2": "l",
+    "point3": "p",
+    "idp": "f",
+    "vector1": "s",
+    "vector3": "v",
+    "vector9": "b",
+}
 
 
 def number(rng: np.random.Generator) -> float:
@@ -42,7 +50,7 @@ def value(kind: str, others: list[np.ndarray], rng: np.random.Generator) -> np.n
     made = numbers(SIZES[kind], rng)
     if others and rng.random() < 0.3:
         near = others[int(rng.integers(len(others)))]
-        n = min(2 if kind.endswith("2") else 3, near.size)
+        n = min(2 if kind.endswith("2") else 3, near.size, made.size)
         made[:n] = near[:n] + rng.choice([0.0, 1e-200, 1e-12, 1.0]) * rng.normal(size=n)
     if kind == "se3":
         made[3:] = quaternion(rng)

@@ -25,7 +25,7 @@ def random_value(kind: str, rng: np.random.Generator) -> np.ndarray:
         return np.concatenate([rng.normal(0, 3, 3), q / np.linalg.norm(q)])
     if kind == "idp":
         return np.array([*rng.normal(0, 3, 3), *rng.uniform(-np.pi, np.pi, 2) * [1.0, 0.4], rng.uniform(0.05, 2.0)])
-    return rng.normal(0, 3, 2 if kind == "point2" else 3)
+    return rng.normal(0, 3, TANGENT[kind])
 
 
 def random_information(dim: int, rng: np.random.Generator) -> np.ndarray:

@@ -17,6 +17,7 @@ LINEAR = (
     *("linear_3_se2_se2", "linear_6_se3_se3", "linear_2_point2_point2", "linear_3_point3_point3", "linear_6_idp_idp"),
     *("linear_2_se2_point2", "linear_3_se3_point3", "linear_6_se3_idp", "linear_3_point3_idp", "linear_5_point2_se2"),
     *("linear_8_se2_se2_point2", "linear_9_se3_point3_idp", "linear_7_point3_se3_se3", "linear_9_se2_point2_se2"),
+    *("linear_9_vector9", "linear_1_vector1_vector1", "linear_7_se3_vector9_se3", "linear_3_se2_vector1_vector9"),
 )
 OTHERS = (
     *(name for name, kind in FACTOR_KINDS.items() if name.startswith(_BEGINNINGS) and not kind.base),
@@ -76,7 +77,7 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
         return group._replace(loss=loss, scale=np.array([1.5])) if loss else group
 
     for n in range(steps):
-        x, y, l, p, f = (symbol(letter, n) for letter in "xylpf")
+        x, y, l, p, f, s, b = (symbol(letter, n) for letter in "xylpfsb")
         plane, space = random_value("se2", rng), random_value("se3", rng)
         if n:
             plane = boxplus("se2", truth[x - 1], np.array([1.0, 0.1, rng.normal(0, 0.6)]))
@@ -85,8 +86,11 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
         variables += [new("point2", "l", n, plane[:2] + rng.uniform(1, 3, 2), given=True)]
         variables += [new("point3", "p", n, space[:3] + rng.uniform(1, 3, 3), given=True)]
         variables += [new("idp", "f", n, random_value("idp", rng), given=True)]
+        variables += [new("vector1", "s", n, random_value("vector1", rng), given=True)]
+        variables += [new("vector9", "b", n, random_value("vector9", rng), given=True)]
         if n == 0:
             factors = [factor("prior_se2", [x], truth, noise, rng), factor("prior_se3", [y], truth, noise, rng)]
+            factors += [made("linear_1_vector1", s)]
         else:
             factors = [factor("between_se2", [x - 1, x], truth, noise, rng)]
             factors += [factor("between_se3", [y - 1, y], truth, noise, rng)]
@@ -99,8 +103,11 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
             factors += [made("range_between_se2", x, x - 1), made("range_between_se3", y - 1, y)]
             factors += [made("linear_8_se2_se2_point2", x, x - 1, l), made("linear_9_se3_point3_idp", y - 1, p, f)]
             factors += [made("linear_7_point3_se3_se3", p - 1, y, y - 1), made("linear_5_point2_se2", l - 1, x)]
+            factors += [made("linear_7_se3_vector9_se3", y - 1, b, y), made("linear_1_vector1_vector1", s - 1, s)]
+            factors += [made("linear_3_se2_vector1_vector9", x, s, b - 1)]
         factors += [
             made("linear_6_idp", f),
+            made("linear_9_vector9", b),
             made("range_se2", x, l),
             made("bearing_se2", x, l),
             made("range_se3", y, p),

@@ -23,7 +23,7 @@ from factorbus.solver.covariance.why import why_factor
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 COUNT = 16
-SPACES = {"plane": ("se2", "point2"), "space": ("se3", "point3", "idp")}
+SPACES = {"plane": ("se2", "point2", "vector1", "vector4"), "space": ("se3", "point3", "idp", "vector3", "vector9")}
 KEYS = [symbol("v", n) for n in range(COUNT)]
 
 

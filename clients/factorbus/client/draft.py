@@ -80,6 +80,14 @@ class Draft:
         """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
         return self.variable("idp", key, value, **held)
 
+    def vector(self, key: Key, value: ArrayLike, **held: Unpack[Held]) -> Draft:
+        """One to nine numbers of any units, which no frame moves: a velocity, a bias, a scale, an offset of clocks.
+
+        What is known of it is said by `linear`; no factor gives it a value.
+        """
+        size = all_finite("vector", as_numbers("vector", value)).size
+        return self.variable(f"vector{size}", key, value, **held)
+
     def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane is in the map: x y (metres), theta (radians)."""
         return self.factor("prior_se2", (key,), measured, **certainty)
@@ -229,10 +237,14 @@ class Draft:
         x - y is the local increment of a pose, the difference of anything else; values: y of each, as it is stored;
         jacobians: H of each, (m, 3) of an se2 or point3, (m, 6) of an se3 or idp, (m, 2) of a point2; residual: b,
         (m,), of any m, and the certainty is of these m.
-        kinds: of each; without, three numbers are a point3 where there are others of space, else an se2.
+        kinds: of each; without, that of the variables in this draft, and of others by how many numbers they have: three
+        are a point3 where there are others of space, else an se2.
         More rows than the variables have scalars are sent as the triangle that says the same.
         """
         numbers = key_numbers(keys).tolist()
+        if kinds is None:
+            known = {number: kind for (kind, *_), (keys_of, *_) in self._variables.items() for number in keys_of}
+            kinds = [known.get(number, "") for number in numbers]
         self._linear.append(linear_factor(numbers, values, jacobians, residual, kinds, certainty))
         return self
 

@@ -7,6 +7,7 @@ space.
 import numpy as np
 
 from factorbus.proto.arrays import F64
+from factorbus.proto.kinds import VARIABLE_KINDS
 
 # Numbers of a pose, by the space that a kind of variable is in.
 SPACES = {"se2": 3, "point2": 3, "se3": 7, "point3": 7, "idp": 7}
@@ -50,7 +51,9 @@ def difference(measured: F64, pose: F64) -> F64:
 
 
 def moved_values(kind: str, values: F64, T_a_b: F64) -> F64:
-    """Values (n, size) of variables of one kind, given in b, as they are in a."""
+    """Values (n, size) of variables of one kind, given in b, as they are in a; vectors are the same in both."""
+    if VARIABLE_KINDS[kind].is_vector:
+        return values
     if kind in ("se2", "se3"):
         return compose(T_a_b, values)
     size = values.shape[1] if kind != "idp" else 3

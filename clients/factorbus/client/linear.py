@@ -24,7 +24,7 @@ def linear_factor(
     values: Sequence[ArrayLike],
     jacobians: Sequence[ArrayLike],
     residual: ArrayLike,
-    kinds: Sequence[str] | None,
+    kinds: Sequence[str],
     certainty: Certainty,
 ) -> Factors:
     """|Σ H (x ⊟ y) + b|² by Ω; see `Draft.linear`.
@@ -32,10 +32,12 @@ def linear_factor(
     Raises BadShape, UnknownKind, BadInformation, BadOption, NotFiniteNumbers.
     """
     where = " ".join(["linear", *map(format_symbol, keys)])
-    for name, given in (("values", values), ("jacobians", jacobians), ("kinds", kinds or ())):
+    for name, given in (("values", values), ("jacobians", jacobians), ("kinds", kinds)):
         of_type(f"{where}: {name}", given, Collection, "one for each key")
     y = [all_finite(where, as_numbers(f"{where}: values", value)) for value in values]
-    names = _kinds_of(where, y) if kinds is None else list(kinds)
+    names = list(kinds)
+    if len(names) == len(y) and not all(names):
+        names = [name or guess for name, guess in zip(names, _kinds_of(where, y, names), strict=True)]
     b = all_finite(where, as_numbers(f"{where}: residual", residual))
     _check_counts(where, keys, len(y), len(jacobians), len(names))
     dims = _checked_dims(where, names, y)
@@ -80,14 +82,16 @@ def _checked_dims(where: str, names: Sequence[str], y: Sequence[F64]) -> list[in
     return [VARIABLE_KINDS[name].dim for name in names]
 
 
-def _kinds_of(where: str, y: Sequence[F64]) -> list[str]:
-    """By how many numbers their values have."""
-    for value in y:
+def _kinds_of(where: str, y: Sequence[F64], names: Sequence[str]) -> list[str]:
+    """Of those without a name by how many numbers their values have; of the others "".  names: "" where not known."""
+    unnamed = [value for value, name in zip(y, names, strict=True) if not name]
+    for value in unnamed:
         if value.ndim != 1 or value.size not in _BY_SIZE:
-            wanted = "(3,) of an se2 or point3, (7,) of an se3, (2,) of a point2, (6,) of an idp"
+            wanted = "(3,) of an se2 or point3, (7,) of an se3, (2,) of a point2, (6,) of an idp, or kinds="
             raise BadShape(f"{where}: values", f"shape {value.shape}", wanted)
-    space = any(value.size in _SPACE for value in y)
-    return ["point3" if space and value.size == 3 else _BY_SIZE[value.size] for value in y]
+    space = any(value.size in _SPACE for value in unnamed) or not {"se3", "point3", "idp"}.isdisjoint(names)
+    by_size = _BY_SIZE | {3: "point3"} if space else _BY_SIZE
+    return ["" if name else by_size[value.size] for value, name in zip(y, names, strict=True)]
 
 
 def _block(where: str, given: ArrayLike, shape: tuple[int, int]) -> F64:

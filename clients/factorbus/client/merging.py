@@ -28,7 +28,7 @@ from factorbus.client.mounts import split_mounts
 from factorbus.client.transform_factors import transform_factors
 from factorbus.client.transform_linear import are_relative
 from factorbus.proto.arrays import F64, I64
-from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, MapGraph, Variables
 from factorbus.proto.mounts import mounts_of, pick_factors
 from factorbus.proto.problems import Problem
@@ -147,7 +147,8 @@ def fit_into(
 
 def _size_of(batch: Batch) -> int:
     """Numbers of a pose in the one space that the map is in."""
-    sizes = {SPACES.get(group.kind, 0) for group in batch.variables if group.keys.size}
+    placed = [group for group in batch.variables if group.keys.size and not VARIABLE_KINDS[group.kind].is_vector]
+    sizes = {SPACES.get(group.kind, 0) for group in placed}
     if len(sizes) != 1 or 0 in sizes:
         kinds = ", ".join(sorted({group.kind for group in batch.variables})) or "nothing"
         raise CannotMerge(f"the other map has {kinds}; wanted variables of the plane alone, or of space")

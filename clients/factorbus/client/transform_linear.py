@@ -4,6 +4,7 @@ import numpy as np
 
 from factorbus.client.frames import moved_values, rotation_of
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.linear import parts_of
 from factorbus.proto.messages import Factors
 
@@ -19,7 +20,8 @@ def are_relative(group: Factors, mounts: I64) -> np.ndarray:
     """
     kinds, y, H, _ = parts_of(group.kind, group.measured)
     said = np.zeros(len(group.keys), bool)
-    for n, on_robots in enumerate(np.isin(group.keys, mounts)):
+    stay = np.array([VARIABLE_KINDS[kind].is_vector for kind in kinds])
+    for n, on_robots in enumerate(np.isin(group.keys, mounts) | stay):
         ends = zip(kinds, y, H, on_robots.tolist(), strict=True)
         parts = [J[n] @ _carried(kind, at[n]) for kind, at, J, is_mount in ends if not is_mount]
         said[n] = not parts or np.abs(sum(parts)).max() <= _ROUNDING * max(np.abs(parts).max(), 1e-300)
@@ -42,7 +44,7 @@ def transform_linear(group: Factors, T_a_b: F64, mounts: I64) -> Factors:
 def _turned(kind: str, before: F64, after: F64, H: F64, T_a_b: F64) -> F64:
     """H of increments after the motion.  Of a feature's direction that is so to first order."""
     R = rotation_of(T_a_b)
-    if kind in ("se2", "se3"):
+    if kind in ("se2", "se3") or VARIABLE_KINDS[kind].is_vector:
         return H
     if kind != "idp":
         return H @ R.T

@@ -129,10 +129,14 @@ def _linear(kind: str) -> Callable[..., F64]:
     def residual(*ends_and_z: F64) -> F64:
         *ends, z = ends_and_z
         of, y, H, b = parts_of(kind, z)
-        steps = (_LESS[end](at, x) for end, at, x in zip(of, y, ends, strict=True))
+        steps = (_LESS.get(end, _less_vector)(at, x) for end, at, x in zip(of, y, ends, strict=True))
         return b + sum(np.einsum("mij,mj->mi", J, step) for J, step in zip(H, steps, strict=True))
 
     return residual
+
+
+def _less_vector(y: F64, x: F64) -> F64:
+    return x[:, : y.shape[1]] - y
 
 
 def _less_idp(y: F64, x: F64) -> F64:
@@ -170,8 +174,6 @@ def _at_mount(kind: str) -> Callable[..., F64]:
 _LESS: Mapping[str, Callable[[F64, F64], F64]] = {
     "se2": _less_se2,
     "se3": lambda y, x: _less_se3(y, x)[:, :6] * (1.0, 1.0, 1.0, 2.0, 2.0, 2.0),
-    "point2": lambda y, x: x[:, :2] - y,
-    "point3": lambda y, x: x[:, :3] - y,
     "idp": _less_idp,
 }
 _RESIDUALS: dict[str, Callable[..., F64]] = {

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+from factorbus.wording import counted
+
 
 @dataclass(frozen=True, slots=True)
 class VariableKind:
@@ -19,6 +21,11 @@ class VariableKind:
     dim: int
     values: str
     is_pose: bool = False
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether it is plain numbers, which no frame moves."""
+        return self.name.startswith("vector")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +94,7 @@ VARIABLE_KINDS = {
         VariableKind("point2", 2, 2, "x y (metres)"),
         VariableKind("point3", 3, 3, "x y z (metres)"),
         VariableKind("idp", 6, 6, "x y z of the first camera (metres), theta, phi (radians), rho (1/metre)"),
+        *(VariableKind(f"vector{n}", n, n, f"{counted(n, 'number')}, of any units") for n in range(1, 10)),
     )
 }
 
@@ -96,18 +104,18 @@ MOST_JOINED = 128
 LINEAR_NAME = "linear_ROWS_KIND_KIND..."
 _LINEAR = "linear_"
 _LINEAR_FORM = re.compile(r"linear_([1-9][0-9]{0,3})((?:_[a-z0-9]+)+)")
-_PLANE = {"se2", "point2"}
+_PLANE, _SPACE = {"se2", "point2"}, {"se3", "point3", "idp"}
 
 
 def linear_kind(rows: int, ends: tuple[str, ...]) -> FactorKind:
-    """The kind of linear factors with these rows and kinds of variables, all of the plane or all of space.
+    """The kind of linear factors with these rows and kinds of variables: of the plane or of space, and vectors.
 
     Raises ValueError: no such kind of variable, kinds of the plane and of space, or too many rows or variables.
     """
     if unknown := [end for end in ends if end not in VARIABLE_KINDS]:
         raise ValueError(f"{unknown[0]!r} is no kind of variable; wanted {', '.join(VARIABLE_KINDS)}")
-    if 0 < sum(end in _PLANE for end in ends) < len(ends):
-        raise ValueError(f"{', '.join(ends)}: wanted all of the plane (se2, point2), or all of space")
+    if _PLANE.intersection(ends) and _SPACE.intersection(ends):
+        raise ValueError(f"{', '.join(ends)}: wanted none of space beside se2 and point2")
     kinds = [VARIABLE_KINDS[end] for end in ends]
     values, scalars = sum(kind.size for kind in kinds), sum(kind.dim for kind in kinds)
     if not (1 <= len(ends) <= MOST_JOINED and 1 <= rows <= scalars + 1):

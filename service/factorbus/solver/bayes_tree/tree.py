@@ -13,6 +13,7 @@ from factorbus.solver.graph.arenas import Arenas, lines
 from factorbus.solver.graph.factor_graph import FactorGraph, roomy, with_room
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree import records
+from factorbus.solver.kernels.bayes_tree.add_to_tree import SAVED
 from factorbus.solver.kernels.bayes_tree.begin_step import HESSIAN
 from factorbus.solver.kernels.bayes_tree.changed_variables import exchange, list_changed
 from factorbus.solver.kernels.bayes_tree.reset_estimate import reset_to_linearization
@@ -64,7 +65,7 @@ class CliqueTree(Arenas):
         self.changed: I64 = np.empty(256, np.int64)
         self.moved: I64 = np.empty(256, np.int64)
         self.marked: I64 = np.empty(256, np.int64)
-        self.saved: F64 = np.empty((16, 8))
+        self.saved: F64 = np.empty((16, SAVED))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
         self.totals: F64 = np.zeros(tl.T_SIZE)
         self.state[tl.S_FREE_CLIQUE], self.state[tl.S_RELINEARIZED_AT] = -1, -self._rest
@@ -171,7 +172,7 @@ class CliqueTree(Arenas):
         if (need := int(self.state[tl.S_HESSIAN]) + new * HESSIAN) > self.hessian.size:
             pages.enlarge(self, "hessian", roomy(need, self.hessian.size))
         if 2 * new > len(self.saved):
-            self.saved = np.empty((4 * new, 8))
+            self.saved = np.empty((4 * new, SAVED))
 
 
 def settings_of(options: Options) -> F64:

@@ -8,6 +8,7 @@ Conventions (those of g2o):
     point3   (x, y, z) metres
     idp      (x, y, z, θ, φ, ρ): where the camera stood that saw it first, metres; azimuth and elevation of what it saw,
              radians, θ in [−π, π); inverse distance ρ, 1/metre.  The point (x, y, z) + m(θ, φ)/ρ
+    vector1 … vector9   numbers of any units, in no frame
 
 A pose x is the frame of the robot seen from the map: it takes robot coordinates to map coordinates.  Increments are
 local (applied on the right), translation first, rotation in radians:
@@ -15,6 +16,7 @@ local (applied on the right), translation first, rotation in radians:
     se2   (t, θ) ⊞ (δt, δθ) = (t + R(θ) δt, wrap(θ + δθ))
     se3   (t, q) ⊞ (δt, δφ) = (t + R(q) δt, q ⊗ exp(δφ)),   δφ a rotation vector
     idp   y ⊞ δ = y + δ, θ wrapped
+    point, vector   x ⊞ δ = x + δ
 
 Residuals, and so information matrices, have the order of the measurement; the rotation part of an se3 residual is the
 vector part (qx, qy, qz) of the error quaternion, its sign chosen so that qw ≥ 0.  χ² = Σ rᵀ Ω r, without a ½.

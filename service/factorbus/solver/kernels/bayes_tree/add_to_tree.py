@@ -14,7 +14,9 @@ from factorbus.solver.kernels.model.factor_rows import is_member, loss_code, row
 from factorbus.solver.kernels.model.kinds import is_bounded
 from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph
-from factorbus.solver.kernels.model.sizes import size_of
+from factorbus.solver.kernels.model.sizes import MOST_SCALARS, size_of
+
+SAVED = MOST_SCALARS + 2  # numbers that are saved of a variable: its diagonal sums, its lever, the step that saw it
 
 
 @part
@@ -55,7 +57,7 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
     T_ADDED gets their χ² at the estimate.  Their first variables are listed: one may have moved since it was
     linearized, and the factor is then off its model from the start.
 
-    saved (2 per factor, 8): what that changes of variables, for `take_out`
+    saved (2 per factor, SAVED): what that changes of variables, for `take_out`
     """
     var, fac, values = graph.var, graph.fac, graph.values
     node, link, hessian, scalars = tree.node, tree.link, tree.hessian, tree.scalars
@@ -151,7 +153,7 @@ def _save(v: int, out: F64, var: I64, node: I64, scalars: F64, turns: F64) -> No
     if d >= 0:
         for a in range(dim_of_variable(var, v)):
             out[a] = scalars[1, d + a]
-    out[6], out[7] = turns[v, tl.U_LEVER], node[v, tl.N_SEEN]
+    out[MOST_SCALARS], out[MOST_SCALARS + 1] = turns[v, tl.U_LEVER], node[v, tl.N_SEEN]
 
 
 @inline_kernel
@@ -160,7 +162,7 @@ def _restore(v: int, kept: F64, var: I64, node: I64, scalars: F64, turns: F64) -
     if d >= 0:
         for a in range(dim_of_variable(var, v)):
             scalars[1, d + a] = kept[a]
-    turns[v, tl.U_LEVER], node[v, tl.N_SEEN] = kept[6], int(kept[7])
+    turns[v, tl.U_LEVER], node[v, tl.N_SEEN] = kept[MOST_SCALARS], int(kept[MOST_SCALARS + 1])
 
 
 @inline_kernel

@@ -10,9 +10,10 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.records import table_of
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
+from factorbus.solver.kernels.model.sizes import MOST_SCALARS
 
 # Doubles of the largest Hessian record.
-HESSIAN = 6 * 6 * 3 + 13
+HESSIAN = 3 * MOST_SCALARS * MOST_SCALARS + 2 * MOST_SCALARS + 1
 
 
 @part

@@ -7,11 +7,11 @@ from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import move_idp
-from factorbus.solver.kernels.model.points import move_point2, move_point3
+from factorbus.solver.kernels.model.points import move_point2, move_point3, move_vector
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se2 import turn_se2
 from factorbus.solver.kernels.model.se3 import move_se3
-from factorbus.solver.kernels.model.sizes import size_of
+from factorbus.solver.kernels.model.sizes import dim_of, is_vector, size_of
 
 # In N_LISTED.
 STAYED, PLACE, MODEL = 0, 1, 2
@@ -55,5 +55,7 @@ def move_to(kind: int, lin: F64, x: int, delta: F64, d: int, out: F64) -> None:
         move_point2(lin, x, delta, d, out)
     elif kind == at.IDP:
         move_idp(lin, x, delta, d, out)
+    elif is_vector(kind):
+        move_vector(dim_of(kind), lin, x, delta, d, out)
     else:
         move_point3(lin, x, delta, d, out)

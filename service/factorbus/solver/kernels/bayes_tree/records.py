@@ -29,7 +29,7 @@ class Tree(NamedTuple):
                              since their factors were evaluated last
     marked  (c,) int64       scratch: cliques that an elimination touches, later those that move as a whole
     motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
-    saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
+    saved   (2 k, SAVED) float64 what the k factors of a step under way change of their variables, for when it fails
     state   int64            counters and the heads of free lists
     totals  (15,) float64    χ² and sums of errors over all factors, and bounds that follow from them
     """

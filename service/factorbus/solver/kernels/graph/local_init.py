@@ -11,17 +11,15 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.small_cholesky import cholesky
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.camera import move_idp
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.many import add_normal_equations, linearize_many, square_of
-from factorbus.solver.kernels.model.points import move_point2, move_point3
 from factorbus.solver.kernels.model.records import Graph, graph_at
-from factorbus.solver.kernels.model.se2 import move_se2
-from factorbus.solver.kernels.model.se3 import move_se3
-from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim, size_of
+from factorbus.solver.kernels.model.retract import move_value
+from factorbus.solver.kernels.model.sizes import MOST_SCALARS, dim_of, information_at, residual_dim, size_of
 
 _ITERATIONS = 5
+_MOST = max(MOST_SCALARS, 7)  # numbers of a value, and scalars
 
 
 class _Linear(NamedTuple):
@@ -49,7 +47,7 @@ def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, graph_table: I6
 def settle(v: int, f0: int, f1: int, least: float, graph: Graph) -> None:
     """The same for one variable."""
     var, values = graph.var, graph.values
-    M, z, step, before = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty(7)
+    M, z, step, before = np.empty((_MOST, _MOST)), np.empty(_MOST), np.empty(_MOST), np.empty(_MOST)
     linear = _Linear(np.empty(at.R_SIZE), np.empty((2, 6, 6)), np.empty((6, 6)))
     x, kind = var[v, at.V_AT], var[v, at.V_KIND]
     dim, size = dim_of(kind), size_of(kind)
@@ -94,7 +92,7 @@ def is_seen_twice(v: int, f0: int, f1: int, fac: I64) -> bool:
 def gather_system(v: int, f0: int, f1: int, graph: Graph, linear: _Linear, M: F64, z: F64) -> float:
     """M = Σ Hᵀ Ω H and z = −Σ Hᵀ Ω r over the factors of variable v among f0 .. f1−1; gives their χ².
 
-    M (6, 6), z (6,); `linear` is scratch
+    M (d, d), z (d,), d the most scalars of a variable; `linear` is scratch
     """
     var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
     r, H, W = linear
@@ -137,14 +135,5 @@ def gather_many(v: int, f: int, graph: Graph, M: F64, z: F64) -> float:
 
 @part
 def move_one(kind: int, values: F64, x: int, step: F64) -> None:
-    """The value at offset x := itself ⊞ step; each ⊞ has read what it needs before it writes."""
-    if kind == at.SE2:
-        move_se2(values, x, step, 0, values)
-    elif kind == at.SE3:
-        move_se3(values, x, step, 0, values)
-    elif kind == at.POINT2:
-        move_point2(values, x, step, 0, values)
-    elif kind == at.IDP:
-        move_idp(values, x, step, 0, values)
-    else:
-        move_point3(values, x, step, 0, values)
+    """The value at offset x := itself ⊞ step."""
+    move_value(kind, values, x, step, 0, values)

@@ -12,7 +12,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.many import add_normal_equations, linearize_many
-from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
+from factorbus.solver.kernels.model.sizes import MOST_SCALARS, dim_of, information_at, residual_dim
 
 # The share of its diagonal entry that a pivot keeps: a point 1000 baselines away keeps 1e-6.
 _ROOM = 1e-8
@@ -21,13 +21,13 @@ _ROOM = 1e-8
 @kernel("int64(int64, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[::1])")
 def mark_determined(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, determined: I64) -> int:
     """Set to 1 in `determined` (an entry a variable from v0 on) what factors f0 .. f1−1 determine; gives the count."""
-    r, H, z = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros(6)
+    r, H, z = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros(MOST_SCALARS)
     place, count = np.full(determined.size, -1), 0
     for k in range(determined.size):
         if determined[k] == 0:
             place[k] = count
             count += 1
-    M, unused = np.zeros((count, 6, 6)), np.zeros(6)
+    M, unused = np.zeros((count, MOST_SCALARS, MOST_SCALARS)), np.zeros(MOST_SCALARS)
     for f in range(f0, f1):
         if is_one_of_many(f, fac):
             n = only_loose(f, v0, fac, determined)
@@ -52,7 +52,7 @@ def mark_determined(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, 
                             both += H[end, b, c] * H[end, a, e]
                         M[place[k], c, e] += payload[p] * both
                 p += 1
-    found, diagonal = 0, np.empty(6)
+    found, diagonal = 0, np.empty(MOST_SCALARS)
     for k in range(determined.size):
         if place[k] < 0:
             continue

@@ -16,10 +16,10 @@ from factorbus.solver.kernels.model.factor_rows import end_of, is_member, is_one
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.many import linearize_many
 from factorbus.solver.kernels.model.records import Graph, graph_at
-from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
+from factorbus.solver.kernels.model.sizes import MOST_SCALARS, dim_of, information_at, residual_dim
 
 MOST_BLOCKS = 5
-_MOST = 6 * MOST_BLOCKS
+_MOST = MOST_SCALARS * MOST_BLOCKS
 
 
 @kernel("int64(int64, int64, int64[::1], int64[::1], int64[::1])")

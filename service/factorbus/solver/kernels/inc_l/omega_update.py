@@ -29,11 +29,11 @@ from factorbus.solver.kernels.model.factor_rows import (
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
 from factorbus.solver.kernels.model.many import Many, linearize_many, upper_factor, width_of
 from factorbus.solver.kernels.model.records import Graph, graph_at
-from factorbus.solver.kernels.model.sizes import information_at, residual_dim
+from factorbus.solver.kernels.model.sizes import MOST_SCALARS, information_at, residual_dim
 
 # Of W at a time.  A step of this kind has at most 24 rows of `fac` (`inc_l.strategy`), so none of its factors has more
-# than seven variables, and 43 rows.
-MOST_ROWS = 48
+# than seven variables, and one row more than these have scalars.
+MOST_ROWS = 64
 _STRIP = 96  # columns that are worked on together: with MOST_ROWS rows they fit the first level cache
 
 
@@ -55,7 +55,7 @@ class Remaining(NamedTuple):
 
 
 class Reflections(NamedTuple):
-    """One for each scalar of a block row: x (6, rows of W), v (6,), scale (6,); and s (_STRIP,), scratch."""
+    """One for each scalar of a block row, d at most: x (d, rows of W), v (d,), scale (d,); and s (_STRIP,), scratch."""
 
     x: F64
     v: F64
@@ -188,7 +188,8 @@ def sweep(height: int, left: Remaining, union: I64, spare: I64, whitened: Whiten
 
     Gives −1, or a position whose pivot is not a positive number.
     """
-    made = Reflections(np.empty((6, height)), np.empty(6), np.empty(6), np.empty(_STRIP))
+    most = MOST_SCALARS
+    made = Reflections(np.empty((most, height)), np.empty(most), np.empty(most), np.empty(_STRIP))
     while left.first < left.count:
         i = union[left.first]
         left = join_lists(i, left, height, union, spare, whitened, rows)

@@ -170,7 +170,9 @@ _DIRECTIONS = _starts(model.directions for model in _MODELS)
 # For Python, which asks for many factors at once: by the code of a kind.
 CAMERA = _LENS_AT >= 0
 BOUNDED = np.array([model.bounded for model in _MODELS])
-POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])  # by the code of a kind of variables
+# By the code of a kind of variables.
+POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])
+VECTOR = np.array([kind.is_vector for kind in VARIABLE_KINDS.values()])
 SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False, False])
 _BASE = _table(at.FACTOR_CODES[model.base] if model.base else -1 for model in _MODELS)
 

@@ -1,4 +1,4 @@
-"""Points in the plane and in space: their priors and ⊞.  MATH §2.3, (3.8).  Arguments as in `se2`."""
+"""Points in the plane and in space, and vectors: ⊞, and priors of points.  MATH §2.3, (3.8).  Arguments as in `se2`."""
 
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel
 
@@ -30,3 +30,10 @@ def move_point2(x: F64, i: int, step: F64, d: int, out: F64) -> None:
 def move_point3(x: F64, i: int, step: F64, d: int, out: F64) -> None:
     """out = x + δ."""
     out[i], out[i + 1], out[i + 2] = x[i] + step[d], x[i + 1] + step[d + 1], x[i + 2] + step[d + 2]
+
+
+@inline_kernel
+def move_vector(n: int, x: F64, i: int, step: F64, d: int, out: F64) -> None:
+    """out = x + δ, of n numbers."""
+    for c in range(n):
+        out[i + c] = x[i + c] + step[d + c]

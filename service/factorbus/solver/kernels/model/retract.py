@@ -1,18 +1,20 @@
 """x ⊞ δ for all variables, which of them changed, and their values gathered per kind.  MATH §2."""
 
+from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import move_idp
 from factorbus.solver.kernels.model.dispatch import check_same, returning
-from factorbus.solver.kernels.model.points import move_point2, move_point3
+from factorbus.solver.kernels.model.points import move_point2, move_point3, move_vector
 from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.se2 import move_se2
 from factorbus.solver.kernels.model.se3 import move_se3
-from factorbus.solver.kernels.model.sizes import size_of
+from factorbus.solver.kernels.model.sizes import dim_of, is_vector, size_of
 
-# x ⊞ δ of every kind of variables of the wire, `factorbus.proto.kinds`.
+# x ⊞ δ of every kind of variables of the wire, `factorbus.proto.kinds`, but of vectors, which have one.
 MOVES = {"se2": move_se2, "se3": move_se3, "point2": move_point2, "idp": move_idp, "point3": move_point3}
-check_same("variable kind", at.VARIABLE_CODES, MOVES, __name__)
+_CODES = {name: code for name, code in at.VARIABLE_CODES.items() if not VARIABLE_KINDS[name].is_vector}
+check_same("variable kind", _CODES, MOVES, __name__)
 
 
 @inline_kernel
@@ -20,7 +22,16 @@ def _no_move(_values: F64, _x: int, _step: F64, _d: int, _out: F64) -> None:
     """Of no kind: there is none."""
 
 
-move_value = inline_kernel(returning("move_value", "values, x, step, d, out", at.VARIABLE_CODES, MOVES, _no_move))
+_move_other = inline_kernel(returning("move_other", "values, x, step, d, out", _CODES, MOVES, _no_move))
+
+
+@inline_kernel
+def move_value(kind: int, values: F64, x: int, step: F64, d: int, out: F64) -> None:
+    """The value at out[x] := that at values[x] ⊞ step[d]; each ⊞ has read what it needs before it writes."""
+    if is_vector(kind):
+        move_vector(dim_of(kind), values, x, step, d, out)
+    else:
+        _move_other(kind, values, x, step, d, out)
 
 
 @kernel("void(int64, int64[:,::1], float64[::1], float64[::1], float64[::1])")

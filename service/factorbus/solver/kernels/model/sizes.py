@@ -13,6 +13,8 @@ _FACTORS, _VARIABLES = tuple(FACTOR_KINDS.values()), tuple(VARIABLE_KINDS.values
 MOST_ENDS = 3  # of a kind with a fixed number of variables
 _SIZE = np.array([kind.size for kind in _VARIABLES], np.int64)
 _DIM = np.array([kind.dim for kind in _VARIABLES], np.int64)
+_IS_VECTOR = np.array([kind.is_vector for kind in _VARIABLES])
+MOST_SCALARS = int(_DIM.max())  # of one variable: the size of the scratch that kernels have for it
 # By the code of a kind of factor; the last two are of linear factors, whose sizes are their own, and of members.
 _RESIDUAL_DIM = np.array([*(kind.dim for kind in _FACTORS), 0, 0], np.int64)
 _MEASURED = np.array([*(kind.size for kind in _FACTORS), 0, 0], np.int64)
@@ -33,6 +35,12 @@ def size_of(kind: int) -> int:
 def dim_of(kind: int) -> int:
     """Scalars in the tangent of a kind of variable."""
     return _DIM[kind]
+
+
+@inline_kernel
+def is_vector(kind: int) -> bool:
+    """Whether a kind of variable is plain numbers, whose ⊞ is +."""
+    return _IS_VECTOR[kind]
 
 
 @inline_kernel
