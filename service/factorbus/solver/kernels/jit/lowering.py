@@ -10,6 +10,7 @@ docs/decisions/private-numba.md.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 import llvmlite.binding
@@ -23,6 +24,7 @@ from numba.core.lowering import Lower
 from numba.core.runtime.context import NRTContext
 from numba.core.typed_passes import NativeLowering
 from numba.np import arrayobj
+from numba.np.arrayobj import load_item, store_item
 
 _from_the_end = arrayobj.fix_integer_index
 
@@ -72,6 +74,54 @@ class OurLower(Lower):
         array = self.context.make_array(ty)(self.context, self.builder, value)
         array.meminfo, array.parent = (cgutils.get_null_value(owner.type) for owner in (array.meminfo, array.parent))
         return array._getvalue()
+
+
+    def delvar(self, name: str) -> None:
+        """Nothing, where there is no reference to give up: Numba loads what is not needed any more, and writes zeros."""
+        if not (self.module.factorbus_borrows or self._is_plain(self.typeof(name))):
+            super().delvar(name)
+
+    def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
+        place = self._place_of_number(value.name, index.name)
+        if place is None:
+            return super().lower_getitem(resty, expr, value, index, signature)
+        array = self.typeof(value.name)
+        return self.context.cast(self.builder, load_item(self.context, self.builder, array, place), array.dtype, resty)
+
+    def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
+        place = self._place_of_number(target_var.name, index_var.name)
+        if place is None:
+            return super().lower_setitem(target_var, index_var, value_var, signature)
+        array = self.typeof(target_var.name)
+        number = self.loadvar(value_var.name)
+        for before, after in pairwise((self.typeof(value_var.name), signature.args[2], array.dtype)):
+            number = self.context.cast(self.builder, number, before, after)
+        return store_item(self.context, self.builder, array, number, place)
+
+    def _place_of_number(self, name: str, index: str) -> Any:
+        """The address of one number of a dense array: row · columns + column.  None where it is for Numba to find: the
+        index is checked, counts from the end or has another kind.
+
+        Numba writes the whole array to memory first, and reads it back word by word.
+        """
+        array, kind = self.typeof(name), self.typeof(index)
+        kinds = kind.types if isinstance(kind, types.BaseTuple) else (kind,)
+        dense = isinstance(array, types.Array) and array.layout == "C" and len(kinds) == array.ndim
+        if self.context.enable_boundscheck or not dense or not all(isinstance(one, types.Integer) for one in kinds):
+            return None
+        if any(isinstance(one, types.IntegerLiteral) and one.literal_value < 0 for one in kinds):
+            return None
+        builder, model, value = self.builder, self.context.data_model_manager[array], self.loadvar(index)
+        indices = cgutils.unpack_tuple(builder, value, len(kinds)) if isinstance(kind, types.BaseTuple) else [value]
+        if any(isinstance(one, ir.Constant) and one.constant < 0 for one in indices):
+            return None
+        value = self.loadvar(name)
+        shape = cgutils.unpack_tuple(builder, model.get(builder, value, "shape"), array.ndim)
+        place = None
+        for one, of, size in zip(indices, kinds, shape, strict=True):
+            number = self.context.cast(builder, one, of, types.intp)
+            place = number if place is None else builder.add(builder.mul(place, size), number)
+        return builder.gep(model.get(builder, value, "data"), [place])
 
 
 def _has_array(kind: Any) -> bool:
