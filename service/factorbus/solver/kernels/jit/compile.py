@@ -14,8 +14,8 @@ stale kernel after a callee in another file was edited.  Hence the rule: a kerne
 and the files that its `KernelFolder` names.  Kernels of another folder have a `KernelFolder` of their own, and the same
 rule for that one.
 
-No slice is assigned an array, and none is sorted by NumPy's way: to compile what the one says of unlike sizes, and the
-other, takes three seconds in each process.
+No slice or row is assigned an array, and none is sorted by NumPy's way: to compile what the one says of unlike sizes,
+and the other, takes three seconds in each process.
 
 An index is 0 or more, or a constant that is written where it is used, as in `a[-1]`; ends of slices may be anything.
 Python counts other negative ones from the end; a kernel does not look for them, which saves a twentieth of a step.

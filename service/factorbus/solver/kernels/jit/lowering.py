@@ -1,7 +1,8 @@
 """How Numba makes machine code of our functions: its own compiler, but for what is changed here.
 
-Arrays that a function is given are borrowed.  Of indices only constants count from the end.  A part stays as it was
-written until a kernel links it, and what a kernel links is its own.
+Arrays that a function is given are borrowed.  Of indices only constants count from the end.  A number of an array is
+read and written in a few instructions.  A part stays as it was written until a kernel links it, and what a kernel links
+is its own.
 
 All of this is Numba's private side, so it is done with releases that were tested (`releases`), and three functions of
 Numba's are exchanged only while a function of ours is compiled (`changed_numba`).  What each change is worth is in
@@ -77,7 +78,7 @@ class OurLower(Lower):
 
 
     def delvar(self, name: str) -> None:
-        """Nothing, where there is no reference to give up: Numba loads what is not needed any more, and writes zeros."""
+        """Nothing, where there is no reference to give up.  Numba loads what is not needed any more, and stores zeros."""
         if not (self.module.factorbus_borrows or self._is_plain(self.typeof(name))):
             super().delvar(name)
 
@@ -105,14 +106,14 @@ class OurLower(Lower):
         Numba writes the whole array to memory first, and reads it back word by word.
         """
         array, kind = self.typeof(name), self.typeof(index)
-        kinds = kind.types if isinstance(kind, types.BaseTuple) else (kind,)
+        kinds = getattr(kind, "types", (kind,))
         dense = isinstance(array, types.Array) and array.layout == "C" and len(kinds) == array.ndim
         if self.context.enable_boundscheck or not dense or not all(isinstance(one, types.Integer) for one in kinds):
             return None
         if any(isinstance(one, types.IntegerLiteral) and one.literal_value < 0 for one in kinds):
             return None
         builder, model, value = self.builder, self.context.data_model_manager[array], self.loadvar(index)
-        indices = cgutils.unpack_tuple(builder, value, len(kinds)) if isinstance(kind, types.BaseTuple) else [value]
+        indices = [value] if kinds == (kind,) else cgutils.unpack_tuple(builder, value, len(kinds))
         if any(isinstance(one, ir.Constant) and one.constant < 0 for one in indices):
             return None
         value = self.loadvar(name)
@@ -261,7 +262,11 @@ _FOR_OTHERS = {
 
 
 class _Compiler(Compiler):
-    """Numba's own compiler, with our lowering and without the passes that find nothing to do."""
+    """Numba's own compiler, with our lowering and without the passes that find nothing to do.
+
+    The lifetimes of variables are worked out before types are found and before lowering, by the passes that need them,
+    and not also after every other pass: the code is the same.
+    """
 
     lowering = _Lowering
 
@@ -274,6 +279,7 @@ class _Compiler(Compiler):
                 if one.__name__ not in _FOR_OTHERS
             ]
             pipeline.finalize()
+            pipeline._ENFORCING = False
         return pipelines
 
 
