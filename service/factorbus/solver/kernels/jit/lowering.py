@@ -76,9 +76,8 @@ class OurLower(Lower):
         array.meminfo, array.parent = (cgutils.get_null_value(owner.type) for owner in (array.meminfo, array.parent))
         return array._getvalue()
 
-
     def delvar(self, name: str) -> None:
-        """Nothing, where there is no reference to give up.  Numba loads what is not needed any more, and stores zeros."""
+        """Nothing, where there is no reference to give up.  Numba loads what is not needed any more, and stores 0."""
         if not (self.module.factorbus_borrows or self._is_plain(self.typeof(name))):
             super().delvar(name)
 
