@@ -100,7 +100,7 @@ class OurLower(Lower):
 
     def _place_of_number(self, name: str, index: str) -> Any:
         """The address of one number of a dense array: row · columns + column.  None where it is for Numba to find: the
-        index is checked, counts from the end or has another kind.
+        index is checked, or has another kind.
 
         Numba writes the whole array to memory first, and reads it back word by word.
         """
@@ -109,17 +109,15 @@ class OurLower(Lower):
         dense = isinstance(array, types.Array) and array.layout == "C" and len(kinds) == array.ndim
         if self.context.enable_boundscheck or not dense or not all(isinstance(one, types.Integer) for one in kinds):
             return None
-        if any(isinstance(one, types.IntegerLiteral) and one.literal_value < 0 for one in kinds):
-            return None
         builder, model, value = self.builder, self.context.data_model_manager[array], self.loadvar(index)
         indices = [value] if kinds == (kind,) else cgutils.unpack_tuple(builder, value, len(kinds))
-        if any(isinstance(one, ir.Constant) and one.constant < 0 for one in indices):
-            return None
         value = self.loadvar(name)
         shape = cgutils.unpack_tuple(builder, model.get(builder, value, "shape"), array.ndim)
         place = None
         for one, of, size in zip(indices, kinds, shape, strict=True):
             number = self.context.cast(builder, one, of, types.intp)
+            if getattr(of, "literal_value", 0) < 0 or (isinstance(one, ir.Constant) and one.constant < 0):
+                number = builder.add(size, number)
             place = number if place is None else builder.add(builder.mul(place, size), number)
         return builder.gep(model.get(builder, value, "data"), [place])
 
