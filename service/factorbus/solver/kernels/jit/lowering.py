@@ -99,25 +99,28 @@ class OurLower(Lower):
         return store_item(self.context, self.builder, array, number, place)
 
     def _place_of_number(self, name: str, index: str) -> Any:
-        """The address of one number of a dense array: row · columns + column.  None where it is for Numba to find: the
-        index is checked, or has another kind.
+        """The address of one number of a dense array: row · columns + column.  None where it is for Numba to find.
 
         Numba writes the whole array to memory first, and reads it back word by word.
         """
         array, kind = self.typeof(name), self.typeof(index)
         kinds = getattr(kind, "types", (kind,))
         dense = isinstance(array, types.Array) and array.layout == "C" and len(kinds) == array.ndim
-        if self.context.enable_boundscheck or not dense or not all(isinstance(one, types.Integer) for one in kinds):
+        if not dense or not all(isinstance(one, types.Integer) for one in kinds):
+            if any(getattr(one, "literal_value", 0) < 0 for one in getattr(kind, "types", ())):
+                raise NotImplementedError(f"a block that counts from the end, {kind}; a kernel takes its row first")
             return None
         builder, model, value = self.builder, self.context.data_model_manager[array], self.loadvar(index)
         indices = [value] if kinds == (kind,) else cgutils.unpack_tuple(builder, value, len(kinds))
         value = self.loadvar(name)
         shape = cgutils.unpack_tuple(builder, model.get(builder, value, "shape"), array.ndim)
         place = None
-        for one, of, size in zip(indices, kinds, shape, strict=True):
+        for axis, (one, of, size) in enumerate(zip(indices, kinds, shape, strict=True)):
             number = self.context.cast(builder, one, of, types.intp)
             if getattr(of, "literal_value", 0) < 0 or (isinstance(one, ir.Constant) and one.constant < 0):
                 number = builder.add(size, number)
+            if self.context.enable_boundscheck:
+                cgutils.do_boundscheck(self.context, builder, number, size, axis)
             place = number if place is None else builder.add(builder.mul(place, size), number)
         return builder.gep(model.get(builder, value, "data"), [place])
 
