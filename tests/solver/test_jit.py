@@ -188,6 +188,34 @@ def test_a_kernel_shows_others_nothing_of_its_parts(kernels):
     assert shown == own
 
 
+INLINE_FIRST = """
+from kernels.jit import compile as _jit
+
+@_jit.part
+def entry(a, k):
+    return a[k]
+
+@_jit.inline_kernel
+def first(a):
+    return entry(a, 0)
+
+@_jit.kernel("float64(float64[::1])")
+def kernel(a):
+    return first(a)
+
+list(_jit.iter_compile(kernel))
+for one in (entry, first):
+    (result,) = one.overloads.values()
+    print("alwaysinline" in result.library.get_llvm_str())
+"""
+
+
+def test_a_part_is_no_inline_kernel_because_one_had_it_compiled(kernels):
+    (kernels / "parts.py").write_text(INLINE_FIRST)
+    done = run(kernels, "import kernels.parts")
+    assert (done.stdout, done.stderr) == ("False\nTrue\n", "")
+
+
 def test_a_variable_that_does_not_change_the_code_leaves_the_folder(kernels):
     _, _, name = results(kernels)
     assert results(kernels, NUMBA_NUM_THREADS="1") == (4.0, False, name)

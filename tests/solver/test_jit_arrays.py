@@ -62,6 +62,33 @@ def test_arrays_live_as_long_as_they_are_used():
     assert sys.getrefcount(pair) == before, "a row that is returned is counted, and released again"
 
 
+@_jit.kernel("void(float64[:,::1], float64[::1], int64[::1], float64[:,:,::1], int64, uint64, int32)")
+def put_numbers(a, b, c, d, i, j, k):
+    """Every way in which a kernel names one number of an array: of one, two and three dimensions."""
+    a[i, j] = 1
+    a[k, 0] = a[i, j] + 1.5
+    a[-1, i] = a[0, 2]
+    a[1, -1] = True
+    b[i] = a[k, 0]
+    b[0] += a[-1, i]
+    b[-1] = i
+    c[j] = 2.75
+    c[k] = c[j] + b[i] * 3
+    d[i, j, k] = c[k]
+    d[0, 1, j - 1] = d[i, j, k] + d[1, -1, 0]
+
+
+def test_numbers_of_arrays_are_those_that_python_puts_there():
+    def arrays():
+        return np.arange(12.0).reshape(3, 4), np.arange(4.0), np.arange(5), np.arange(24.0).reshape(2, 3, 4)
+
+    found, wanted = arrays(), arrays()
+    put_numbers(*found, 1, np.uint64(2), np.int32(3 - 1))
+    getattr(put_numbers, "py_func", put_numbers)(*wanted, 1, 2, 2)
+    for ours, pythons in zip(found, wanted, strict=True):
+        assert ours.tolist() == pythons.tolist()
+
+
 @_jit.kernel("float64(float64[:,::1], int64[::1])")
 def first_of_chosen(rows, some):
     """A choice of rows is a copy of them, and no call has made it."""

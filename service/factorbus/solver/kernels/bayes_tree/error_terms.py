@@ -84,7 +84,7 @@ def lever_error_of(root: float, d: float, phi: float, shift: float) -> float:
 
 
 @part
-def add_sighting(
+def add_observation(
     kind: int, lever_error: float, root: float, d: float, shift: float, gradient: float
 ) -> tuple[float, float]:  # fmt: skip
     """The lever error, with what (9.5) has beside (9.4), and the shift error (9.12) of an observation of a landmark,

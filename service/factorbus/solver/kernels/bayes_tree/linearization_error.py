@@ -13,7 +13,7 @@ from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.error_terms import (
     LINKS,
     SEEN,
-    add_sighting,
+    add_observation,
     lever_error_of,
     shift_between,
     turn_between,
@@ -229,7 +229,7 @@ def error_of(
         )
         both = LINKS * shift_error > lever_error
     else:
-        lever_error, shift_error = add_sighting(kind, lever_error, root, d, shift, factor_errors[f, tl.E_SHIFT])
+        lever_error, shift_error = add_observation(kind, lever_error, root, d, shift, factor_errors[f, tl.E_SHIFT])
         full = error = min(SEEN * (lever_error + shift_error), MOST_ERROR)
         both = kind == at.BEARING_RANGE_SE2 or shift_error > lever_error
     if error > threshold:

@@ -159,7 +159,8 @@ def take_blocks(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64) -
         return False
     for k in range(renewed.size):
         row = clique[renewed[k]]
-        old[k] = row
+        for column in range(tl.C_WIDTH):
+            old[k, column] = row[column]
         lead, row[tl.C_LD], used, size = row_layout(row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS])
         row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE] = take_numbers(size, numbers, state)
         row[tl.C_ROWS], row[tl.C_USED] = row[tl.C_BLOCK] + lead, row[tl.C_BLOCK] + used

@@ -44,7 +44,7 @@ def admit_groups(raw: bytes, groups: I64, graph_table: I64) -> tuple:
     """
     graph = graph_at(graph_table)
     counts = graph.counts
-    fault = look_over(groups, graph)
+    fault = check_room(groups, graph)
     if fault != gt.GOOD:
         return fault, -1, -1, 0
     v0, f0, rest = counts[at.VARIABLES], counts[at.FACTORS], 0
@@ -72,7 +72,7 @@ def admit_groups(raw: bytes, groups: I64, graph_table: I64) -> tuple:
 
 
 @part
-def look_over(groups: I64, graph: Graph) -> int:
+def check_room(groups: I64, graph: Graph) -> int:
     """GOOD; NO_ROOM: the groups do not fit behind what there is; NO_LIMITS: a lens has no limit yet."""
     counts = graph.counts
     variables, factors = counts[at.VARIABLES], counts[at.FACTORS]

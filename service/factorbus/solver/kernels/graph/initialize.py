@@ -149,7 +149,7 @@ def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F
     return new
 
 
-@inline_kernel
+@part
 def compose_end(kind: int, forward: bool, i: int, j: int, z: int, x: F64, p: F64) -> None:
     """Give the end that has no value the one that makes the residual zero."""
     if kind == at.BETWEEN_SE2:

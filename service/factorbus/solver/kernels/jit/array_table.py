@@ -83,17 +83,21 @@ else:
 
     def make_array(context: Any, builder: Any, made: Any, address: Any, shape: list[Any]) -> Any:
         """An array that nobody counts the references of."""
-        array = context.make_array(made)(context, builder)
         size = context.get_constant(types.intp, _WORD)
-        strides = [size] if len(shape) == 1 else [builder.mul(shape[1], size), size]
-        array.meminfo = context.get_constant_null(types.voidptr)
-        array.parent = context.get_constant_null(types.pyobject)
-        array.nitems = shape[0] if len(shape) == 1 else builder.mul(shape[0], shape[1])
-        array.itemsize = size
-        array.data = builder.inttoptr(address, array.data.type)
-        array.shape = _tuple(builder, shape)
-        array.strides = _tuple(builder, strides)
-        return array._getvalue()
+        model = context.data_model_manager[made]
+        fields = {
+            "meminfo": context.get_constant_null(types.voidptr),
+            "parent": context.get_constant_null(types.pyobject),
+            "nitems": shape[0] if len(shape) == 1 else builder.mul(shape[0], shape[1]),
+            "itemsize": size,
+            "data": builder.inttoptr(address, context.get_value_type(types.CPointer(made.dtype))),
+            "shape": _tuple(builder, shape),
+            "strides": _tuple(builder, [size] if len(shape) == 1 else [builder.mul(shape[1], size), size]),
+        }
+        array = ir.Constant(context.get_value_type(made), ir.Undefined)
+        for name, value in fields.items():
+            array = model.set(builder, array, value, name)
+        return array
 
     def _tuple(builder: Any, values: list[Any]) -> Any:
         made = ir.Constant(ir.ArrayType(values[0].type, len(values)), ir.Undefined)

@@ -14,8 +14,8 @@ stale kernel after a callee in another file was edited.  Hence the rule: a kerne
 and the files that its `KernelFolder` names.  Kernels of another folder have a `KernelFolder` of their own, and the same
 rule for that one.
 
-No slice is assigned an array, and none is sorted by NumPy's way: to compile what the one says of unlike sizes, and the
-other, takes three seconds in each process.
+No slice or row is assigned an array, and none is sorted by NumPy's way: to compile what the one says of unlike sizes,
+and the other, takes three seconds in each process.
 
 An index is 0 or more, or a constant that is written where it is used, as in `a[-1]`; ends of slices may be anything.
 Python counts other negative ones from the end; a kernel does not look for them, which saves a twentieth of a step.
@@ -100,8 +100,9 @@ _lowering: Any = None if STOCK else import_module(".lowering", __package__)
 
 # Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
-# Without "fastmath" a function would take it over from the kernel that has it compiled first.
-_EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False}
+# A flag that is left out is taken over from the function that has this one compiled first: a part that an inline kernel
+# calls would be inlined wherever it is called, or nowhere, by the order in which kernels are compiled.
+_EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False, "forceinline": False}
 _QUICK_FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "nogil": False}
 _FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
 # Of numba's variables, those that leave the code as it is: no kernel is parallel.
@@ -167,8 +168,9 @@ class KernelFolder:
     def _linked(self, function: Callable[..., Any], **flags: Any) -> Any:
         """A function that kernels link.  Called from Python, as tests do, it is compiled as a kernel."""
         if STOCK:
-            return _ours(numba.njit(**flags, **self._flags)(function))
-        dispatcher = _ours(numba.njit(pipeline_class=_lowering.PartCompiler, **flags, **self._flags)(function))
+            return _ours(numba.njit(**{**self._flags, **flags})(function))
+        flags = {"pipeline_class": _lowering.PartCompiler, **self._flags, **flags}
+        dispatcher = _ours(numba.njit(**flags)(function))
         find = dispatcher.get_call_template
         dispatcher.get_call_template = lambda args, kws: find(tuple(map(_common, args)), kws)
 

@@ -1,7 +1,8 @@
 """How Numba makes machine code of our functions: its own compiler, but for what is changed here.
 
-Arrays that a function is given are borrowed.  Of indices only constants count from the end.  A part stays as it was
-written until a kernel links it, and what a kernel links is its own.
+Arrays that a function is given are borrowed.  Of indices only constants count from the end.  A number of an array is
+read and written in a few instructions.  A part stays as it was written until a kernel links it, and what a kernel links
+is its own.
 
 All of this is Numba's private side, so it is done with releases that were tested (`releases`), and three functions of
 Numba's are exchanged only while a function of ours is compiled (`changed_numba`).  What each change is worth is in
@@ -10,6 +11,7 @@ docs/decisions/private-numba.md.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 import llvmlite.binding
@@ -23,6 +25,7 @@ from numba.core.lowering import Lower
 from numba.core.runtime.context import NRTContext
 from numba.core.typed_passes import NativeLowering
 from numba.np import arrayobj
+from numba.np.arrayobj import load_item, store_item
 
 _from_the_end = arrayobj.fix_integer_index
 
@@ -72,6 +75,54 @@ class OurLower(Lower):
         array = self.context.make_array(ty)(self.context, self.builder, value)
         array.meminfo, array.parent = (cgutils.get_null_value(owner.type) for owner in (array.meminfo, array.parent))
         return array._getvalue()
+
+    def delvar(self, name: str) -> None:
+        """Nothing, where there is no reference to give up.  Numba loads what is not needed any more, and stores 0."""
+        if not (self.module.factorbus_borrows or self._is_plain(self.typeof(name))):
+            super().delvar(name)
+
+    def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
+        place = self._place_of_number(value.name, index.name)
+        if place is None:
+            return super().lower_getitem(resty, expr, value, index, signature)
+        array = self.typeof(value.name)
+        return self.context.cast(self.builder, load_item(self.context, self.builder, array, place), array.dtype, resty)
+
+    def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
+        place = self._place_of_number(target_var.name, index_var.name)
+        if place is None:
+            return super().lower_setitem(target_var, index_var, value_var, signature)
+        array = self.typeof(target_var.name)
+        number = self.loadvar(value_var.name)
+        for before, after in pairwise((self.typeof(value_var.name), signature.args[2], array.dtype)):
+            number = self.context.cast(self.builder, number, before, after)
+        return store_item(self.context, self.builder, array, number, place)
+
+    def _place_of_number(self, name: str, index: str) -> Any:
+        """The address of one number of a dense array: row · columns + column.  None where it is for Numba to find.
+
+        Numba writes the whole array to memory first, and reads it back word by word.
+        """
+        array, kind = self.typeof(name), self.typeof(index)
+        kinds = getattr(kind, "types", (kind,))
+        dense = isinstance(array, types.Array) and array.layout == "C" and len(kinds) == array.ndim
+        if not dense or not all(isinstance(one, types.Integer) for one in kinds):
+            if any(getattr(one, "literal_value", 0) < 0 for one in getattr(kind, "types", ())):
+                raise NotImplementedError(f"a block that counts from the end, {kind}; a kernel takes its row first")
+            return None
+        builder, model, value = self.builder, self.context.data_model_manager[array], self.loadvar(index)
+        indices = [value] if kinds == (kind,) else cgutils.unpack_tuple(builder, value, len(kinds))
+        value = self.loadvar(name)
+        shape = cgutils.unpack_tuple(builder, model.get(builder, value, "shape"), array.ndim)
+        place = None
+        for axis, (one, of, size) in enumerate(zip(indices, kinds, shape, strict=True)):
+            number = self.context.cast(builder, one, of, types.intp)
+            if getattr(of, "literal_value", 0) < 0 or (isinstance(one, ir.Constant) and one.constant < 0):
+                number = builder.add(size, number)
+            if self.context.enable_boundscheck:
+                cgutils.do_boundscheck(self.context, builder, number, size, axis)
+            place = number if place is None else builder.add(builder.mul(place, size), number)
+        return builder.gep(model.get(builder, value, "data"), [place])
 
 
 def _has_array(kind: Any) -> bool:
@@ -211,7 +262,11 @@ _FOR_OTHERS = {
 
 
 class _Compiler(Compiler):
-    """Numba's own compiler, with our lowering and without the passes that find nothing to do."""
+    """Numba's own compiler, with our lowering and without the passes that find nothing to do.
+
+    The lifetimes of variables are worked out before types are found and before lowering, by the passes that need them,
+    and not also after every other pass: the code is the same.
+    """
 
     lowering = _Lowering
 
@@ -224,6 +279,7 @@ class _Compiler(Compiler):
                 if one.__name__ not in _FOR_OTHERS
             ]
             pipeline.finalize()
+            pipeline._ENFORCING = False
         return pipelines
 
 

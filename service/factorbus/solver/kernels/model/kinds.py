@@ -44,7 +44,7 @@ class FactorModel:
 
     residual:     r, A = ∂r/∂xᵢ, B = ∂r/∂xⱼ of one factor.  equation: where MATH has it
     of_kinds:     the function is that of several kinds, and takes the code of the kind first
-    common:       it melts into the kernels, which costs time to compile; others are called
+    common:       it melts into `residual_of`; others are called from there
     initializes:  an end without a value gets one from it (`graph.initialize`)
     rigid:        r is the same where both ends move as one body, and that is made use of (`bayes_tree.rigid_subtrees`)
     bounded:      its linearization error has a closed form, (9.4) to (9.13); of others it is computed, (9.11)
@@ -245,4 +245,4 @@ def _other_residual(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F6
 
 
 # The residual function of a kind: residual_of(kind, x, ends, p, k, r, A, B); gives what χ² has beside rᵀ Ω r.
-residual_of = inline_kernel(dispatcher("residual_of", _common, _other_residual))
+residual_of = part(dispatcher("residual_of", _common, _other_residual))

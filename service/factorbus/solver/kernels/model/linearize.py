@@ -56,7 +56,7 @@ def linearize(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
             continue
         row = fac[f]
         kind, p = row[at.F_KIND], row[at.F_AT]
-        chi2 += evaluate(f, var, fac, values, payload, r, H[0], H[1])
+        chi2 += evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
         # Sizes as constants, so that each call becomes straight code.
         if kind == at.BETWEEN_SE2 or kind == at.PRIOR_SE2:
             chi2 += add_factor(3, 3, 3, row, var, payload[p + 3 :], scratch, system)
@@ -72,14 +72,8 @@ def linearize(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
     return chi2
 
 
-@part
-def evaluate_apart(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
-    """`evaluate`, compiled apart: for kernels that have more to do than this."""
-    return evaluate(f, var, fac, x, payload, r, A, B)
-
-
 @inline_kernel
-def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
+def evaluate_apart(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
     """The residual kernel of the kind of factor `f`, and its loss; gives what χ² has beside rᵀ Ω r."""
     kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
     i = var[fac[f, at.F_I], at.V_AT]
