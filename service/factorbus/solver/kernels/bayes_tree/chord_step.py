@@ -1,0 +1,242 @@
+"""A chord step: residuals are taken anew at the estimate, and R is kept.  MATH §9.7
+
+A Newton step with the factorization of an earlier point converges as fast as that point is near (Kelley, Iterative
+Methods for Linear and Nonlinear Equations, ch. 5).  Here its equations are those of the tree, in which the model of a
+factor, r₀ + J₀ δ, is corrected by what it misses of the residual at the estimate,
+
+    r₀ + J₀ δ + m,   m = r(x̂) − r₀ − J₀ δ̂                                                               (9.35)
+
+with J₀ as it is in R.  So only right-hand sides change:
+
+1  correct      the gradients of the factors whose model misses much
+2  forward      d = R⁻ᵀ η in their cliques and those above, children first
+3  substitute   back down, as in any step
+4  measure      what is left to miss is counted from there
+5  let go       of what waited to be relinearized and has no large error any more
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.add_to_tree import last_of_hessian, next_incidence
+from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
+from factorbus.solver.kernels.bayes_tree.back_substitute import QUIET, substitute
+from factorbus.solver.kernels.bayes_tree.linearization_error import measure
+from factorbus.solver.kernels.bayes_tree.missed_residual import missed_se2, missed_se3, turn_se2
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
+from factorbus.solver.kernels.bayes_tree.records import Tree
+from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import head_of
+from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
+from factorbus.solver.kernels.model.records import Graph
+from factorbus.solver.kernels.model.sizes import information_at
+from factorbus.solver.kernels.sparse import fronts as fr
+
+FREE = 0
+
+
+@inline_kernel
+def is_correctable(f: int, link: I64) -> bool:
+    """Whether what the model of factor f misses is known as a vector: between poses, without a loss."""
+    return link[f, tl.L_KIND] == at.BETWEEN_SE2 or link[f, tl.L_KIND] == at.BETWEEN_SE3
+
+
+@part
+def error_left(tree: Tree) -> float:
+    """Σ error² as it will be after a chord step, at least."""
+    total = 0.0
+    for f in range(tree.state[tl.S_FACTORS]):
+        total += tree.factor_errors[f, tl.E_LEAVES]
+    return total
+
+
+@part
+def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
+    """Correct the factors whose error² is more than `least`, and solve with R as it is; gives Σ error² as `measure`."""
+    node, clique, state = tree.node, tree.clique, tree.state
+    # 1
+    state[tl.S_STAMP] += 1
+    scratch, end = make_scratch(), tree.marked.size
+    for f in range(state[tl.S_FACTORS]):
+        if tree.factor_errors[f, tl.E_ERROR] > least and is_correctable(f, tree.link):
+            correct_factor(graph, tree, f, scratch)
+            for a in range(2):
+                v = graph.fac[f, at.F_I + a]
+                note_moved(MODEL, v, node, tree.moved, state)
+                end = mark_above(v, node, clique, state, tree.marked, end)
+    # 2
+    roots = forward(graph, tree, tree.marked[end:].copy())
+    # 3
+    quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
+    substitute(graph, tree, roots, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked)
+    # 4, 5
+    state[tl.S_DUE], state[tl.S_CHORDS] = 0, state[tl.S_CHORDS] + 1
+    weighted_error = measure(graph, tree, settings)
+    let_go(graph, tree)
+    return weighted_error if state[tl.S_PENDING] > 0 else 0.0
+
+
+@part
+def correct_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
+    """The gradient of factor f, −J₀ᵀ Ω (r₀ + m), and its (r₀ + m)ᵀ Ω (r₀ + m), with m as it is at the estimate."""
+    var, fac, row, hessian = graph.var, graph.fac, tree.factor_errors[f], tree.hessian
+    i, j, r, A, B, W = fac[f, at.F_I], fac[f, at.F_J], scratch.r, scratch.H[0], scratch.H[1], scratch.W
+    evaluate_apart(f, var, fac, tree.lin[0], graph.payload, r, A, B)
+    planar = fac[f, at.F_KIND] == at.BETWEEN_SE2
+    dim = 3 if planar else 6
+    p = fac[f, at.F_AT] + information_at(fac[f, at.F_KIND])
+    for a in range(dim):
+        for b in range(a, dim):
+            W[a, b] = W[b, a] = graph.payload[p]
+            p += 1
+    m = missed_by(planar, graph, tree, f, A)
+    di, dj = dim_of_variable(var, i), dim_of_variable(var, j)
+    last = last_of_hessian(f, var, fac, tree.link)
+    g = last - di - dj
+    chi2 = 0.0
+    for a in range(dim):
+        total = 0.0
+        for b in range(dim):
+            total += W[a, b] * (r[b] + m[b])
+        chi2 += total * (r[a] + m[a])
+        scratch.H[2, 0, a] = total
+    for c in range(dim):
+        first = second = 0.0
+        for a in range(dim):
+            first += A[a, c] * scratch.H[2, 0, a]
+            second += B[a, c] * scratch.H[2, 0, a]
+        put(hessian, g + c, -first)
+        put(hessian, g + di + c, -second)
+    put(hessian, last, chi2)
+    if row[tl.E_FORM] < tl.CORRECTED:
+        row[tl.E_FORM] += tl.CORRECTED
+
+
+@inline_kernel
+def missed_by(planar: bool, graph: Graph, tree: Tree, f: int, A: F64) -> F64:
+    """m of (9.35), which `factor_errors` gets as well.  A: ∂r/∂xᵢ at the linearization points."""
+    var, fac, row, m = graph.var, graph.fac, tree.factor_errors[f], np.zeros(6)
+    if planar:
+        i, j = fac[f, at.F_I], fac[f, at.F_J]
+        x, y, _ = missed_se2(
+            var[i, at.V_AT], var[j, at.V_AT], turn_se2(i, var, tree.scalars[0]), graph.values, tree.lin[0]
+        )
+        c, s = tree.turns[i, tl.U_COS], tree.turns[i, tl.U_SIN]
+        row[tl.E_MISSED], row[tl.E_MISSED + 1] = x, y
+        x, y = c * x + s * y, c * y - s * x
+        m[0], m[1] = -A[0, 0] * x - A[0, 1] * y, -A[1, 0] * x - A[1, 1] * y
+        return m
+    m[0], m[1], m[2], m[3], m[4], m[5], _, _ = missed_se3(graph, tree, f)
+    for a in range(6):
+        row[tl.E_MISSED + a] = m[a]
+    return m
+
+
+@part
+def forward(graph: Graph, tree: Tree, cliques: I64) -> I64:
+    """d and the right-hand sides of update matrices anew, in `cliques`, children first; gives those that are roots."""
+    var, clique, lists, numbers = graph.var, tree.clique, tree.lists, tree.numbers
+    state, totals = tree.state, tree.totals
+    widest, count = 0, 0
+    for k in range(cliques.size):
+        widest = max(widest, clique[cliques[k], tl.C_PIVOTS] + clique[cliques[k], tl.C_SEPARATOR_SCALARS] + 1)
+    eta, roots = np.empty(widest), np.empty(cliques.size, np.int64)
+    for k in range(cliques.size):
+        row = clique[cliques[k]]
+        width = 0
+        for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
+            tree.node[lists[s], tl.N_COLUMN] = width
+            width += dim_of_variable(var, lists[s])
+        gather_right_side(graph, tree, row, eta)
+        if row[tl.C_PARENT] < 0:
+            roots[count] = cliques[k]
+            count += 1
+            totals[tl.T_MODEL] -= numbers[row[tl.C_UPDATE]]
+        solve_right_side(row, numbers, eta)
+        if row[tl.C_PARENT] < 0:
+            totals[tl.T_MODEL] += numbers[row[tl.C_UPDATE]]
+        row[tl.C_FIRST], row[tl.C_MARK] = -1, state[tl.S_STAMP]
+    return roots[:count]
+
+
+@part
+def gather_right_side(graph: Graph, tree: Tree, row: I64, eta: F64) -> None:
+    """eta = Σ −J₀ᵀ Ω (r₀ + m) of the factors and η' of the children of a clique, by its columns, and χ² behind them."""
+    var, fac, node, link, clique = graph.var, graph.fac, tree.node, tree.link, tree.clique
+    lists, numbers, hessian = tree.lists, tree.numbers, tree.hessian
+    last = row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS]
+    for a in range(last + 1):
+        eta[a] = 0.0
+    for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
+        f = node[lists[s], tl.N_OWN]
+        while f >= 0:
+            i, j = fac[f, at.F_I], fac[f, at.F_J]
+            di, dj = dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0
+            g = last_of_hessian(f, var, fac, link) - di - dj
+            if var[i, at.V_COLUMN] >= 0:
+                add_to(eta, node[i, tl.N_COLUMN], hessian, g, di)
+            if j >= 0 and var[j, at.V_COLUMN] >= 0:
+                add_to(eta, node[j, tl.N_COLUMN], hessian, g + di, dj)
+            eta[last] += load(hessian, g + di + dj)
+            f = link[f, tl.L_OWN]
+    child = row[tl.C_CHILD]
+    while child >= 0:
+        other = clique[child]
+        start, m = other[tl.C_LIST] + other[tl.C_FRONTALS], other[tl.C_SEPARATOR_SCALARS]
+        source, wide, x = other[tl.C_UPDATE] + m, other[tl.C_WIDTH_UPDATE], 0
+        for s in range(start, start + other[tl.C_SEPARATORS]):
+            into = node[lists[s], tl.N_COLUMN]
+            for a in range(dim_of_variable(var, lists[s])):
+                eta[into + a] += load(numbers, source + fr.update_row(x, wide))
+                x += 1
+        eta[last] += load(numbers, source + fr.update_row(m, wide))
+        child = other[tl.C_NEXT]
+
+
+@inline_kernel
+def add_to(eta: F64, into: int, hessian: F64, g: int, count: int) -> None:
+    """eta[into : into+count] += hessian[g : g+count]"""
+    for a in range(count):
+        eta[into + a] += load(hessian, g + a)
+
+
+@part
+def solve_right_side(row: I64, numbers: F64, eta: F64) -> None:
+    """d = R_F⁻ᵀ η_F into the rows of a clique, and η_S − R_Sᵀ d and χ² − dᵀd into its update matrix."""
+    p, m, ld = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], row[tl.C_LD]
+    last = p + m
+    for k in range(p):
+        line = row[tl.C_ROWS] + k * ld
+        d = eta[k] / load(numbers, line + k)
+        for c in range(k + 1, last):
+            put(eta, c, load(eta, c) - load(numbers, line + c) * d)
+        eta[last] -= d * d
+        put(numbers, line + last, d)
+    into, wide = row[tl.C_UPDATE] + m, row[tl.C_WIDTH_UPDATE]
+    for a in range(m + 1):
+        put(numbers, into + fr.update_row(a, wide), eta[p + a])
+
+
+@part
+def let_go(graph: Graph, tree: Tree) -> None:
+    """Variables that wait and have no factor with an error that counts do not wait any more."""
+    fac, node, link, pending, state = graph.fac, tree.node, tree.link, tree.pending, tree.state
+    count = 0
+    for k in range(state[tl.S_PENDING]):
+        v = pending[k]
+        slot, waits = node[v, tl.N_ADJ], False
+        while slot >= 0 and not waits:
+            waits = tree.factor_errors[head_of(slot // 2, fac), tl.E_COUNTED] > 0.0
+            slot = next_incidence(slot, link)
+        if waits:
+            pending[count] = v
+            count += 1
+        else:
+            node[v, tl.N_FLAGS] = FREE
+    state[tl.S_PENDING] = count
+    if count == 0:
+        state[tl.S_DUE] = 0
