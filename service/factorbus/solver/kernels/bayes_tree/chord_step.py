@@ -12,13 +12,12 @@ with J₀ as it is in R.  So only right-hand sides change:
 2  forward      d = R⁻ᵀ η in their cliques and those above, children first
 3  substitute   back down, as in any step
 4  measure      what is left to miss is counted from there
-5  let go       of what waited to be relinearized and has no large error any more
 """
 
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.add_to_tree import last_of_hessian, next_incidence
+from factorbus.solver.kernels.bayes_tree.add_to_tree import last_of_hessian
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.back_substitute import QUIET, substitute
 from factorbus.solver.kernels.bayes_tree.linearization_error import measure
@@ -30,13 +29,10 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.factor_rows import head_of
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import information_at
 from factorbus.solver.kernels.sparse import fronts as fr
-
-FREE = 0
 
 
 @inline_kernel
@@ -73,11 +69,9 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     # 3
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
     substitute(graph, tree, roots, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked)
-    # 4, 5
+    # 4
     state[tl.S_DUE], state[tl.S_CHORDS] = 0, state[tl.S_CHORDS] + 1
-    weighted_error = measure(graph, tree, settings)
-    let_go(graph, tree)
-    return weighted_error if state[tl.S_PENDING] > 0 else 0.0
+    return measure(graph, tree, settings)
 
 
 @part
@@ -219,24 +213,3 @@ def solve_right_side(row: I64, numbers: F64, eta: F64) -> None:
     into, wide = row[tl.C_UPDATE] + m, row[tl.C_WIDTH_UPDATE]
     for a in range(m + 1):
         put(numbers, into + fr.update_row(a, wide), eta[p + a])
-
-
-@part
-def let_go(graph: Graph, tree: Tree) -> None:
-    """Variables that wait and have no factor with an error that counts do not wait any more."""
-    fac, node, link, pending, state = graph.fac, tree.node, tree.link, tree.pending, tree.state
-    count = 0
-    for k in range(state[tl.S_PENDING]):
-        v = pending[k]
-        slot, waits = node[v, tl.N_ADJ], False
-        while slot >= 0 and not waits:
-            waits = tree.factor_errors[head_of(slot // 2, fac), tl.E_COUNTED] > 0.0
-            slot = next_incidence(slot, link)
-        if waits:
-            pending[count] = v
-            count += 1
-        else:
-            node[v, tl.N_FLAGS] = FREE
-    state[tl.S_PENDING] = count
-    if count == 0:
-        state[tl.S_DUE] = 0

@@ -44,6 +44,7 @@ MUCH = 8  # where more than one variable in this number has moved, all factors a
 # The running sums are computed anew once the magnitudes added to them exceed this multiple of χ².
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
+NOTHING_COUNTS = 1e-9  # of χ²: what waits and has less error², after a chord step, has not waited yet
 ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
 FORCE = 0.5  # of φ |√Ω r| and ψ |√Ω_θ r_θ|, (9.30)
 MOST_ERROR = 1e100  # of a factor: its square is still a number
@@ -57,7 +58,7 @@ def measure(graph: Graph, tree: Tree, settings: F64) -> float:
     """
     var = graph.var
     factor_errors, pending, state, totals = tree.factor_errors, tree.pending, tree.state, tree.totals
-    if state[tl.S_PENDING] == 0:
+    if state[tl.S_PENDING] == 0 or totals[tl.T_COUNTED] <= NOTHING_COUNTS * totals[tl.T_CHI2]:
         state[tl.S_WAITING] = state[tl.S_STEP]
     most = 0.0
     if state[tl.S_MOVED] > 0:
@@ -215,27 +216,28 @@ def error_of(
     node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
     lin, delta = tree.lin[0], tree.scalars[0]
     x, y, planar, free = var[v, at.V_AT], var[second, at.V_AT], var[v, at.V_KIND] == at.SE2, var[v, at.V_COLUMN] >= 0
+    phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
+    d, root, moved = factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT], shift_between(planar, x, y, values, lin)
+    lever_error = lever_error_of(root, d, phi, moved)
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
         if kind == at.BETWEEN_SE2:
-            lever_error, shift, psi = missed_error_se2(graph, tree, f)
+            missed, shift, psi = missed_error_se2(graph, tree, f)
         else:
-            lever_error, shift, psi = missed_error_se3(graph, tree, f)
-        shift_error = factor_errors[f, tl.E_SHIFT] * math.sqrt(gap) * shift
-        leaves = min(shift_error + FORCE * psi * math.sqrt(chi2), MOST_ERROR)
+            missed, shift, psi = missed_error_se3(graph, tree, f)
+        shift_error = factor_errors[f, tl.E_SHIFT] * math.sqrt(gap)
+        leaves = min(shift_error * shift + FORCE * psi * math.sqrt(chi2), MOST_ERROR)
         full, error = (
-            min(lever_error + leaves, MOST_ERROR),
-            min(lever_error + LINKS * shift_error, MOST_ERROR),
+            min(missed + leaves, MOST_ERROR),
+            min(missed + LINKS * shift_error * shift, MOST_ERROR),
         )
-        both = LINKS * shift_error > lever_error
+        both = LINKS * shift_error * moved > lever_error
+        marks = lever_error + LINKS * shift_error * moved > threshold
     else:
-        phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
-        d, root = factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT]
-        shift = shift_between(planar, x, y, values, lin)
-        lever_error = lever_error_of(root, d, phi, shift)
-        lever_error, shift_error = add_sighting(kind, lever_error, root, d, shift, factor_errors[f, tl.E_SHIFT])
+        lever_error, shift_error = add_sighting(kind, lever_error, root, d, moved, factor_errors[f, tl.E_SHIFT])
         full = error = leaves = min(SEEN * (lever_error + shift_error), MOST_ERROR)
         both = kind == at.BEARING_RANGE_SE2 or shift_error > lever_error
-    if error > threshold:
+        marks = error > threshold
+    if marks:
         if free:
             mark_pending(v, node, pending, state)
         if (both or not free) and var[second, at.V_COLUMN] >= 0:
@@ -246,9 +248,27 @@ def error_of(
 @part
 def mark_large_errors(least: float, graph: Graph, tree: Tree) -> None:
     """The variables of all factors whose error² in full is more than `least` wait."""
+    var, fac = graph.var, graph.fac
     for f in range(tree.state[tl.S_FACTORS]):
-        if tree.factor_errors[f, tl.E_ERROR] > least:
-            mark_ends_pending(f, graph.fac, graph.var, tree.node, tree.pending, tree.state)
+        if tree.factor_errors[f, tl.E_ERROR] > least or moves_far(f, least, graph, tree):
+            mark_ends_pending(f, fac, var, tree.node, tree.pending, tree.state)
+
+
+@inline_kernel
+def moves_far(f: int, least: float, graph: Graph, tree: Tree) -> bool:
+    """Whether (9.4) and (9.13) of a factor between poses come to more than `least`, squared, though its model may miss
+    less: one that is left behind where its neighbours are relinearized misses as much as they have shifted.
+    """
+    var, row, kind, second = graph.var, tree.factor_errors[f], tree.link[f, tl.L_KIND], graph.fac[f, at.F_J]
+    if kind != at.BETWEEN_SE2 and kind != at.BETWEEN_SE3:
+        return False
+    v, root = graph.fac[f, at.F_I], row[tl.E_ROOT]
+    d = var[v, at.V_SCALAR]
+    phi = turn_of(var[v, at.V_KIND], tree.scalars[0], d) if d >= 0 else 0.0
+    shift = shift_between(kind == at.BETWEEN_SE2, var[v, at.V_AT], var[second, at.V_AT], graph.values, tree.lin[0])
+    gap = math.sqrt(max(row[tl.E_CHI2], 0.0)) / root if root > 0.0 else 0.0
+    error = lever_error_of(root, row[tl.E_LEVER], phi, shift) + row[tl.E_SHIFT] * gap * shift
+    return error * error > least
 
 
 @inline_kernel
