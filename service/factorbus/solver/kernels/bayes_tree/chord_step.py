@@ -20,18 +20,20 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import last_of_hessian
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.back_substitute import QUIET, substitute
+from factorbus.solver.kernels.bayes_tree.eliminate_again import lap
 from factorbus.solver.kernels.bayes_tree.linearization_error import measure
-from factorbus.solver.kernels.bayes_tree.missed_residual import missed_se2, missed_se3, turn_se2
+from factorbus.solver.kernels.bayes_tree.missed_residual import error_quaternion, missed_se2, missed_se3, turn_se2
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.cycle_counter import cycles
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
 from factorbus.solver.kernels.model.records import Graph
-from factorbus.solver.kernels.model.sizes import information_at
+from factorbus.solver.kernels.model.se3 import rotation_matrix, turn_slope
 from factorbus.solver.kernels.sparse import fronts as fr
 
 
@@ -54,6 +56,7 @@ def error_left(tree: Tree) -> float:
 def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     """Correct the factors whose error² is more than `least`, and solve with R as it is; gives Σ error² as `measure`."""
     node, clique, state = tree.node, tree.clique, tree.state
+    now = cycles()
     # 1
     state[tl.S_STAMP] += 1
     scratch, end = make_scratch(), tree.marked.size
@@ -64,70 +67,109 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
                 v = graph.fac[f, at.F_I + a]
                 note_moved(MODEL, v, node, tree.moved, state)
                 end = mark_above(v, node, clique, state, tree.marked, end)
+    now = lap(now, tl.LINEARIZE, state)
     # 2
     roots = forward(graph, tree, tree.marked[end:].copy())
+    now = lap(now, tl.ELIMINATE, state)
     # 3
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
     substitute(graph, tree, roots, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked)
     # 4
     state[tl.S_DUE], state[tl.S_CHORDS] = 0, state[tl.S_CHORDS] + 1
-    return measure(graph, tree, settings)
+    weighted_error = measure(graph, tree, settings)
+    lap(now, tl.SUBSTITUTE, state)
+    return weighted_error
 
 
-@part
+@inline_kernel
 def correct_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     """The gradient of factor f, −J₀ᵀ Ω (r₀ + m), and its (r₀ + m)ᵀ Ω (r₀ + m), with m as it is at the estimate."""
-    var, fac, row, hessian = graph.var, graph.fac, tree.factor_errors[f], tree.hessian
-    i, j, r, A, B, W = fac[f, at.F_I], fac[f, at.F_J], scratch.r, scratch.H[0], scratch.H[1], scratch.W
-    evaluate_apart(f, var, fac, tree.lin[0], graph.payload, r, A, B)
-    planar = fac[f, at.F_KIND] == at.BETWEEN_SE2
-    dim = 3 if planar else 6
-    p = fac[f, at.F_AT] + information_at(fac[f, at.F_KIND])
-    for a in range(dim):
-        for b in range(a, dim):
-            W[a, b] = W[b, a] = graph.payload[p]
-            p += 1
-    m = missed_by(planar, graph, tree, f, A)
-    di, dj = dim_of_variable(var, i), dim_of_variable(var, j)
-    last = last_of_hessian(f, var, fac, tree.link)
-    g = last - di - dj
-    chi2 = 0.0
-    for a in range(dim):
-        total = 0.0
-        for b in range(dim):
-            total += W[a, b] * (r[b] + m[b])
-        chi2 += total * (r[a] + m[a])
-        scratch.H[2, 0, a] = total
-    for c in range(dim):
-        first = second = 0.0
-        for a in range(dim):
-            first += A[a, c] * scratch.H[2, 0, a]
-            second += B[a, c] * scratch.H[2, 0, a]
-        put(hessian, g + c, -first)
-        put(hessian, g + di + c, -second)
-    put(hessian, last, chi2)
+    row = tree.factor_errors[f]
+    if graph.fac[f, at.F_KIND] == at.BETWEEN_SE2:
+        correct_se2(graph, tree, f, scratch)
+    else:
+        correct_se3(graph, tree, f, scratch)
     if row[tl.E_FORM] < tl.CORRECTED:
         row[tl.E_FORM] += tl.CORRECTED
 
 
-@inline_kernel
-def missed_by(planar: bool, graph: Graph, tree: Tree, f: int, A: F64) -> F64:
-    """m of (9.35), which `factor_errors` gets as well.  A: ∂r/∂xᵢ at the linearization points."""
-    var, fac, row, m = graph.var, graph.fac, tree.factor_errors[f], np.zeros(6)
-    if planar:
-        i, j = fac[f, at.F_I], fac[f, at.F_J]
-        x, y, _ = missed_se2(
-            var[i, at.V_AT], var[j, at.V_AT], turn_se2(i, var, tree.scalars[0]), graph.values, tree.lin[0]
-        )
-        c, s = tree.turns[i, tl.U_COS], tree.turns[i, tl.U_SIN]
-        row[tl.E_MISSED], row[tl.E_MISSED + 1] = x, y
-        x, y = c * x + s * y, c * y - s * x
-        m[0], m[1] = -A[0, 0] * x - A[0, 1] * y, -A[1, 0] * x - A[1, 1] * y
-        return m
-    m[0], m[1], m[2], m[3], m[4], m[5], _, _ = missed_se3(graph, tree, f)
+@part
+def correct_se2(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
+    """`correct_factor` between plane poses."""
+    var, fac, row, hessian, p = graph.var, graph.fac, tree.factor_errors[f], tree.hessian, graph.payload
+    i, j, r, A, B = fac[f, at.F_I], fac[f, at.F_J], scratch.r, scratch.H[0], scratch.H[1]
+    evaluate_apart(f, var, fac, tree.lin[0], p, r, A, B)
+    phi = turn_se2(i, var, tree.scalars[0])
+    x, y, _ = missed_se2(var[i, at.V_AT], var[j, at.V_AT], phi, graph.values, tree.lin[0])
+    row[tl.E_MISSED], row[tl.E_MISSED + 1] = x, y
+    # In the frame of the residual, to which A takes translations of the first pose, turned about.
+    c, s = tree.turns[i, tl.U_COS], tree.turns[i, tl.U_SIN]
+    x, y = c * x + s * y, c * y - s * x
+    r[0] -= A[0, 0] * x + A[0, 1] * y
+    r[1] -= A[1, 0] * x + A[1, 1] * y
+    k = fac[f, at.F_AT] + 3
+    ex = p[k] * r[0] + p[k + 1] * r[1] + p[k + 2] * r[2]
+    ey = p[k + 1] * r[0] + p[k + 3] * r[1] + p[k + 4] * r[2]
+    et = p[k + 2] * r[0] + p[k + 4] * r[1] + p[k + 5] * r[2]
+    last = last_of_hessian(f, var, fac, tree.link)
+    for a in range(3):
+        put(hessian, last - 6 + a, -(A[0, a] * ex + A[1, a] * ey + A[2, a] * et))
+        put(hessian, last - 3 + a, -(B[0, a] * ex + B[1, a] * ey + B[2, a] * et))
+    put(hessian, last, r[0] * ex + r[1] * ey + r[2] * et)
+
+
+@part
+def correct_se3(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
+    """`correct_factor` between poses in space, whose Jacobians (3.6) are made of five rotations."""
+    var, fac, p, lin = graph.var, graph.fac, graph.payload, tree.lin[0]
+    row, hessian, r, W = tree.factor_errors[f], tree.hessian, scratch.r, scratch.W
+    i, j, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
+    m0, m1, m2, m3, m4, m5, _, _ = missed_se3(graph, tree, f)
+    row[tl.E_MISSED], row[tl.E_MISSED + 1], row[tl.E_MISSED + 2] = m0, m1, m2
+    row[tl.E_MISSED + 3], row[tl.E_MISSED + 4], row[tl.E_MISSED + 5] = m3, m4, m5
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, i + 3)
+    z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation_matrix(p, k + 3)
+    tx, ty, tz = lin[j] - lin[i], lin[j + 1] - lin[i + 1], lin[j + 2] - lin[i + 2]
+    dx, dy, dz = a0 * tx + a3 * ty + a6 * tz, a1 * tx + a4 * ty + a7 * tz, a2 * tx + a5 * ty + a8 * tz
+    tx, ty, tz = dx - p[k], dy - p[k + 1], dz - p[k + 2]
+    v0, v1, v2, w = error_quaternion(i, j, k, p, lin)
+    r[0], r[1] = z0 * tx + z3 * ty + z6 * tz + m0, z1 * tx + z4 * ty + z7 * tz + m1
+    r[2], r[3], r[4], r[5] = z2 * tx + z5 * ty + z8 * tz + m2, v0 + m3, v1 + m4, v2 + m5
+    q, chi2, e = k + 7, 0.0, W[0]
     for a in range(6):
-        row[tl.E_MISSED + a] = m[a]
-    return m
+        e[a] = 0.0
+    for a in range(6):
+        e[a] += p[q] * r[a]
+        q += 1
+        for b in range(a + 1, 6):
+            e[a] += p[q] * r[b]
+            e[b] += p[q] * r[a]
+            q += 1
+    for a in range(6):
+        chi2 += e[a] * r[a]
+    # R_z times the force and the torque on the first pose.
+    fx, fy, fz = z0 * e[0] + z1 * e[1] + z2 * e[2], z3 * e[0] + z4 * e[1] + z5 * e[2], z6 * e[0] + z7 * e[1] + z8 * e[2]
+    w = turn_slope(w)
+    sx, sy, sz = v1 * e[5] - v2 * e[4], v2 * e[3] - v0 * e[5], v0 * e[4] - v1 * e[3]
+    nx, ny, nz = 0.5 * (w * e[3] + sx), 0.5 * (w * e[4] + sy), 0.5 * (w * e[5] + sz)
+    last = last_of_hessian(f, var, fac, tree.link)
+    g = last - 12
+    put(hessian, g, fx)
+    put(hessian, g + 1, fy)
+    put(hessian, g + 2, fz)
+    put(hessian, g + 3, dy * fz - dz * fy + z0 * nx + z1 * ny + z2 * nz)
+    put(hessian, g + 4, dz * fx - dx * fz + z3 * nx + z4 * ny + z5 * nz)
+    put(hessian, g + 5, dx * fy - dy * fx + z6 * nx + z7 * ny + z8 * nz)
+    # Rᵢ, then Rⱼᵀ, take the force to the second pose.
+    tx, ty, tz = a0 * fx + a1 * fy + a2 * fz, a3 * fx + a4 * fy + a5 * fz, a6 * fx + a7 * fy + a8 * fz
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, j + 3)
+    put(hessian, g + 6, -(a0 * tx + a3 * ty + a6 * tz))
+    put(hessian, g + 7, -(a1 * tx + a4 * ty + a7 * tz))
+    put(hessian, g + 8, -(a2 * tx + a5 * ty + a8 * tz))
+    put(hessian, g + 9, -0.5 * (w * e[3] - sx))
+    put(hessian, g + 10, -0.5 * (w * e[4] - sy))
+    put(hessian, g + 11, -0.5 * (w * e[5] - sz))
+    put(hessian, last, chi2)
 
 
 @part

@@ -1,6 +1,6 @@
 """What the linear model of a factor between two poses misses of its residual at the estimate, exactly.  MATH §9.6
 
-With R₀ and R the first pose's rotation where it is linearized and at the estimate, φ its turn from one to the other, and
+With R₀ and R the first pose's rotation where it is linearized and at the estimate, φ its turn between these, and
 t₀ and t what lies between the two positions, in the map's frame, the model misses of what the first pose sees
 
     Rᵀt − R₀ᵀt + φ × R₀ᵀt₀                                                                               (9.33)

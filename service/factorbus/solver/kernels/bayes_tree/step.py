@@ -106,9 +106,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         if state[tl.S_WAIT] != 0 or not goes_on(weighted_error, scaled, state, totals):
             break
         if may_keep_factor(tree, scaled):
-            now = cycles()
             weighted_error = chord_step(least_error(scaled, state, totals), graph, tree, scaled)
-            lap(now, tl.SUBSTITUTE, state)
             began = cycles()
             totals[tl.T_GAINED] = max(totals[tl.T_GAINED], chi2 - totals[tl.T_CHI2])
             if totals[tl.T_CHI2] <= chi2 and not goes_on(weighted_error, scaled, state, totals):
