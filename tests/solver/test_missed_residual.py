@@ -16,6 +16,7 @@ from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.records import graph_at
+from factorbus.solver.kernels.model.retract import move
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
 # Nothing is relinearized, so linearization errors are large.
@@ -71,8 +72,6 @@ def test_what_is_missed_is_the_residual_less_the_model(world: str, turn: float) 
 
 def put_estimate(graph, tree) -> None:
     """The values are those of the tree's δ."""
-    from factorbus.solver.kernels.model.retract import move
-
     move(int(graph.counts[at.VARIABLES]), graph.var, tree.lin[0].copy(), tree.scalars[0].copy(), graph.values)
 
 
@@ -85,15 +84,19 @@ def evaluated(graph, f: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def relative_motion(graph, f: int, lin: np.ndarray) -> tuple[float, float]:
-    """By how much the second pose has shifted and turned as seen from the first, between `lin` and the values."""
+    """By how much the second pose has shifted and turned as seen from the first, between `lin` and the values.
+
+    In space the chord of the turn, 2 sin ½ψ.
+    """
     seen = []
     for values in (lin, graph.values):
         i, j = (matrix_of(graph, int(graph.fac[f, end]), values) for end in (at.F_I, at.F_J))
         seen.append(np.linalg.inv(i) @ j)
     was, now = seen
     turn = was[:-1, :-1].T @ now[:-1, :-1]
-    sine = np.linalg.norm(turn - turn.T) / np.sqrt(8.0)
-    return float(np.linalg.norm(now[:-1, -1] - was[:-1, -1])), float(np.arcsin(min(sine, 1.0)))
+    angle = np.arcsin(np.linalg.norm(turn - turn.T) / np.sqrt(8.0))
+    shift = float(np.linalg.norm(now[:-1, -1] - was[:-1, -1]))
+    return shift, float(angle if len(turn) == 2 else 2.0 * np.sin(0.5 * angle))
 
 
 def matrix_of(graph, v: int, values: np.ndarray) -> np.ndarray:

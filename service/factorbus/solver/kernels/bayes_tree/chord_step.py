@@ -1,4 +1,4 @@
-"""A chord step: residuals are taken anew at the estimate, and R is kept.  MATH §9.7
+"""A chord step: residuals are taken anew at the estimate, and R is kept.  MATH §9.6
 
 A Newton step with the factorization of an earlier point converges as fast as that point is near (Kelley, Iterative
 Methods for Linear and Nonlinear Equations, ch. 5).  Here its equations are those of the tree, in which the model of a
@@ -188,14 +188,17 @@ def forward(graph: Graph, tree: Tree, cliques: I64) -> I64:
             tree.node[lists[s], tl.N_COLUMN] = width
             width += dim_of_variable(var, lists[s])
         gather_right_side(graph, tree, row, eta)
+        was = numbers[row[tl.C_UPDATE]]
+        solve_right_side(row, numbers, eta)
+        row[tl.C_FIRST], row[tl.C_MARK] = -1, state[tl.S_STAMP]
         if row[tl.C_PARENT] < 0:
             roots[count] = cliques[k]
             count += 1
-            totals[tl.T_MODEL] -= numbers[row[tl.C_UPDATE]]
-        solve_right_side(row, numbers, eta)
-        if row[tl.C_PARENT] < 0:
-            totals[tl.T_MODEL] += numbers[row[tl.C_UPDATE]]
-        row[tl.C_FIRST], row[tl.C_MARK] = -1, state[tl.S_STAMP]
+            totals[tl.T_MODEL] += numbers[row[tl.C_UPDATE]] - was
+    if count == state[tl.S_ROOTS]:  # running sums lose digits
+        totals[tl.T_MODEL] = totals[tl.T_CONSTANT]
+        for k in range(count):
+            totals[tl.T_MODEL] += numbers[clique[roots[k], tl.C_UPDATE]]
     return roots[:count]
 
 

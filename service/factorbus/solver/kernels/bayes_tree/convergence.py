@@ -12,6 +12,7 @@ MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
 LARGE_GAIN = 0.05  # of χ², in one round or all,
 AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
+MOST_LEFT = 0.5  # of the Σ error² that is allowed: what a chord step may leave, as it counts as a round
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -56,7 +57,7 @@ def may_keep_factor(tree: Tree, settings: F64) -> bool:
         state[tl.S_CHORDS] == 0
         and state[tl.S_CONTINUES] == 0
         and state[tl.S_RAISED] == 0
-        and error_left(tree) <= 0.5 * allowed(settings, state, totals)
+        and error_left(tree) <= MOST_LEFT * allowed(settings, state, totals)
     )
 
 

@@ -16,6 +16,7 @@ from factorbus.solver.kernels.bayes_tree.error_terms import (
     add_sighting,
     lever_error_of,
     shift_between,
+    turn_error,
     turn_of,
 )
 from factorbus.solver.kernels.bayes_tree.exact_error import exact_error
@@ -46,7 +47,7 @@ CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
 NOTHING_COUNTS = 1e-9  # of χ²: what waits and has less error², after a chord step, has not waited yet
 ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
-FORCE = 0.5  # of φ |√Ω r| and ψ |√Ω_θ r_θ|, (9.30)
+FORCE = 0.5  # of ψ |√Ω r|, (9.30)
 MOST_ERROR = 1e100  # of a factor: its square is still a number
 
 
@@ -208,9 +209,10 @@ def evaluate_factor(
 def error_of(
     graph: Graph, tree: Tree, f: int, v: int, threshold: float, gap: float, chi2: float
 ) -> tuple[float, float, float]:
-    """How far factor f, whose first variable is v, is from its linear model: as it counts, in full, and what a chord
-    step leaves of that.  Where
-    that is more than `relinearize_threshold`, v waits.  (9.5), (9.12), (9.13), (9.33), (9.34)
+    """How far factor f, whose first variable is v, is from its linear model: as it counts, in full, and what of that a
+    chord step leaves.  Between poses v waits where (9.4) is more than `relinearize_threshold`, else where the error is.
+
+    Between poses in space (9.4) and (9.26) stand for (9.33) and (9.34) where they are below that threshold.
     """
     var, values, kind, second = graph.var, graph.values, graph.fac[f, at.F_KIND], graph.fac[f, at.F_J]
     node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
@@ -220,18 +222,18 @@ def error_of(
     d, root, moved = factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT], shift_between(planar, x, y, values, lin)
     lever_error = lever_error_of(root, d, phi, moved)
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
+        shift_error = factor_errors[f, tl.E_SHIFT] * math.sqrt(gap)
+        bound = lever_error + LINKS * shift_error * moved
+        both, marks = LINKS * shift_error * moved > lever_error, bound > threshold
         if kind == at.BETWEEN_SE2:
             missed, shift, psi = missed_error_se2(graph, tree, f)
         else:
-            missed, shift, psi = missed_error_se3(graph, tree, f)
-        shift_error = factor_errors[f, tl.E_SHIFT] * math.sqrt(gap)
+            turn = phi + (turn_of(at.SE3, delta, var[second, at.V_SCALAR]) if var[second, at.V_COLUMN] >= 0 else 0.0)
+            missed, shift, psi = lever_error + turn_error(phi, turn, factor_errors[f, tl.E_TURN]), moved, turn
+            if marks or missed > threshold or factor_errors[f, tl.E_FORM] >= tl.CORRECTED:
+                missed, shift, psi = missed_error_se3(graph, tree, f)
         leaves = min(shift_error * shift + FORCE * psi * math.sqrt(chi2), MOST_ERROR)
-        full, error = (
-            min(missed + leaves, MOST_ERROR),
-            min(missed + LINKS * shift_error * shift, MOST_ERROR),
-        )
-        both = LINKS * shift_error * moved > lever_error
-        marks = lever_error + LINKS * shift_error * moved > threshold
+        full, error = min(missed + leaves, MOST_ERROR), min(missed + LINKS * shift_error * shift, MOST_ERROR)
     else:
         lever_error, shift_error = add_sighting(kind, lever_error, root, d, moved, factor_errors[f, tl.E_SHIFT])
         full = error = leaves = min(SEEN * (lever_error + shift_error), MOST_ERROR)
