@@ -37,11 +37,13 @@ def drive(world: str, poses: int, seed: int, judged: bool = True) -> Iterator[Ta
     solver, batch = Solver(), Solver(BATCH)
     for step in WORLDS[world](poses, seed):
         solver.stage(step.batch)
-        batch.stage(step.batch)
-        report = solver.step()
+        report, optimum = solver.step(), 0.0
+        if judged:
+            batch.stage(step.batch)
+            optimum = batch.step().chi2
         state = tree_of(solver).state
         ended = state[tl.S_CHORDS] == 1 and state[tl.S_ROUNDS] == 1
-        yield Taken(solver, report, bool(ended), batch.step().chi2 if judged else 0.0)
+        yield Taken(solver, report, bool(ended), optimum)
 
 
 @pytest.mark.parametrize(("world", "poses", "seed"), [("sphere", 130, 3), ("manhattan", 300, 7)])
@@ -57,19 +59,19 @@ def test_a_chord_step_ends_a_step_near_the_optimum_without_relinearizing(world: 
     assert ended > 2
 
 
-@pytest.mark.parametrize(("world", "poses", "seed"), [("sphere", 130, 3), ("manhattan", 300, 7)])
+@pytest.mark.parametrize(("world", "poses", "seed"), [("sphere", 130, 3), ("manhattan", 600, 7)])
 def test_its_errors_are_counted_from_there(world: str, poses: int, seed: int) -> None:
-    """It ends within its bound, and an odometry step after it relinearizes nothing and needs no other chord step."""
+    """It ends within its bound; the next step on the sphere, the next odometry step in streets, asks for nothing."""
     after, chord = 0, False
     for taken in drive(world, poses, seed, judged=False):
         state, totals = tree_of(taken.solver).state, tree_of(taken.solver).totals
         assert not taken.ended_by_chord or totals[tl.T_ERROR] <= totals[tl.T_ALLOWED]
-        if chord and taken.report.new_factors <= taken.report.new_variables:
+        if chord and (world == "sphere" or taken.report.new_factors <= taken.report.new_variables):
             after += 1
             assert taken.report.relinearized == 0
             assert state[tl.S_CHORDS] == 0
         chord = taken.ended_by_chord
-    assert after > 1
+    assert after > 2
 
 
 @pytest.mark.parametrize(("world", "poses", "seed"), [("sphere", 130, 3), ("manhattan", 300, 7)])
