@@ -20,6 +20,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
+DEFAULT = Options()
 BATCH = Options(mode="all-batch", batch_tolerance=1e-10, max_iterations=50)
 
 
@@ -32,9 +33,9 @@ class Taken(NamedTuple):
     optimum: float
 
 
-def drive(world: str, poses: int, seed: int, judged: bool = True) -> Iterator[Taken]:
+def drive(world: str, poses: int, seed: int, judged: bool = True, options: Options = DEFAULT) -> Iterator[Taken]:
     """The steps of a drive."""
-    solver, batch = Solver(), Solver(BATCH)
+    solver, batch = Solver(options), Solver(BATCH)
     for step in WORLDS[world](poses, seed):
         solver.stage(step.batch)
         report, optimum = solver.step(), 0.0
@@ -46,7 +47,7 @@ def drive(world: str, poses: int, seed: int, judged: bool = True) -> Iterator[Ta
         yield Taken(solver, report, bool(ended), optimum)
 
 
-@pytest.mark.parametrize(("world", "poses", "seed"), [("sphere", 130, 3), ("manhattan", 300, 7)])
+@pytest.mark.parametrize(("world", "poses", "seed"), [("sphere", 130, 3), ("manhattan", 450, 7)])
 def test_a_chord_step_ends_a_step_near_the_optimum_without_relinearizing(world: str, poses: int, seed: int) -> None:
     ended = 0
     for taken in drive(world, poses, seed):
@@ -59,14 +60,13 @@ def test_a_chord_step_ends_a_step_near_the_optimum_without_relinearizing(world: 
     assert ended > 2
 
 
-@pytest.mark.parametrize(("world", "poses", "seed"), [("sphere", 130, 3), ("manhattan", 600, 7)])
-def test_its_errors_are_counted_from_there(world: str, poses: int, seed: int) -> None:
-    """It ends within its bound; the next step on the sphere, the next odometry step in streets, asks for nothing."""
+def test_its_errors_are_counted_from_there() -> None:
+    """It ends within its bound, and an odometry step after it asks for nothing."""
     after, chord = 0, False
-    for taken in drive(world, poses, seed, judged=False):
+    for taken in drive("manhattan", 600, 7, judged=False):
         state, totals = tree_of(taken.solver).state, tree_of(taken.solver).totals
         assert not taken.ended_by_chord or totals[tl.T_ERROR] <= totals[tl.T_ALLOWED]
-        if chord and (world == "sphere" or taken.report.new_factors <= taken.report.new_variables):
+        if chord and taken.report.new_factors <= taken.report.new_variables:
             after += 1
             assert taken.report.relinearized == 0
             assert state[tl.S_CHORDS] == 0
@@ -76,15 +76,15 @@ def test_its_errors_are_counted_from_there(world: str, poses: int, seed: int) ->
 
 @pytest.mark.parametrize(("world", "poses", "seed"), [("sphere", 130, 3), ("manhattan", 300, 7)])
 def test_the_tree_solves_the_corrected_models(world: str, poses: int, seed: int) -> None:
-    """Σ J₀ᵀ Ω (r₀ + J₀ δ + m) is zero where back-substitution leaves nothing undone."""
+    """Σ J₀ᵀ Ω (r₀ + J₀ δ + m) is zero, as back-substitution leaves nothing undone here."""
     checked = 0
-    for taken in drive(world, poses, seed, judged=False):
+    for taken in drive(world, poses, seed, judged=False, options=Options(wildfire_threshold=0.0)):
         if taken.ended_by_chord:
             checked += 1
             of_models, uncorrected = gradients(taken.solver)
-            assert np.abs(of_models).max() < 0.2 * np.abs(uncorrected).max()
-            assert np.abs(of_models).max() < 1.0
-    assert checked > 2
+            assert np.abs(of_models).max() < 1e-8
+            assert np.abs(uncorrected).max() > 1e-2
+    assert checked > 1
 
 
 def test_a_copy_goes_on_from_a_chord_step_to_the_same_bits() -> None:
