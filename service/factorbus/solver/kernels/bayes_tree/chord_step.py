@@ -75,7 +75,7 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
     substitute(graph, tree, roots, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked)
     # 4
-    state[tl.S_DUE], state[tl.S_CHORDS] = 0, state[tl.S_CHORDS] + 1
+    state[tl.S_DUE], state[tl.S_WAITING], state[tl.S_CHORDS] = 0, state[tl.S_STEP], state[tl.S_CHORDS] + 1
     weighted_error = measure(graph, tree, settings)
     lap(now, tl.SUBSTITUTE, state)
     return weighted_error

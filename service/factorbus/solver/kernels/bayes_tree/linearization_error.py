@@ -45,7 +45,6 @@ MUCH = 8  # where more than one variable in this number has moved, all factors a
 # The running sums are computed anew once the magnitudes added to them exceed this multiple of χ².
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
-NOTHING_COUNTS = 1e-9  # of χ²: what waits and has less error², after a chord step, has not waited yet
 ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
 FORCE = 0.5  # of ψ |√Ω r|, (9.30)
 MOST_ERROR = 1e100  # of a factor: its square is still a number
@@ -59,7 +58,7 @@ def measure(graph: Graph, tree: Tree, settings: F64) -> float:
     """
     var = graph.var
     factor_errors, pending, state, totals = tree.factor_errors, tree.pending, tree.state, tree.totals
-    if state[tl.S_PENDING] == 0 or totals[tl.T_COUNTED] <= NOTHING_COUNTS * totals[tl.T_CHI2]:
+    if state[tl.S_PENDING] == 0:
         state[tl.S_WAITING] = state[tl.S_STEP]
     most = 0.0
     if state[tl.S_MOVED] > 0:
