@@ -30,9 +30,9 @@ Angles of the plane add up; turns in space do not.  With ψ the turn of j as see
     √ω_θ ψ (½ φ + ψ² / 24)                                                                               (9.26)
 
 ω_θ being the information of the angle: in the Hessian of j, as a residual counts half of it.  And the force √Ω r(x)
-turns with j as seen from i, by half of which the gradient is off on the way:
+turns with j as seen from i, by which the gradient is off:
 
-    ½ ψ |√Ω r(x)|                                                                                        (9.30)
+    ψ |√Ω r(x)|                                                                                          (9.30)
 
 That counts as a bound only.  The error of an observation of a camera, and of a factor with a loss, includes that of
 the weight w; it is computed: what the linear model misses of √w r, in standard deviations,

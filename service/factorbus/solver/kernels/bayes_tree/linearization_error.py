@@ -46,7 +46,6 @@ MUCH = 8  # where more than one variable in this number has moved, all factors a
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
 ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
-FORCE = 0.5  # of ψ |√Ω r|, (9.30)
 MOST_ERROR = 1e100  # of a factor: its square is still a number
 
 
@@ -231,7 +230,7 @@ def error_of(
             missed, shift, psi = lever_error + turn_error(phi, turn, factor_errors[f, tl.E_TURN]), moved, turn
             if marks or missed > threshold or factor_errors[f, tl.E_FORM] >= tl.CORRECTED:
                 missed, shift, psi = missed_error_se3(graph, tree, f)
-        leaves = min(shift_error * shift + FORCE * psi * math.sqrt(chi2), MOST_ERROR)
+        leaves = min(shift_error * shift + psi * math.sqrt(chi2), MOST_ERROR)
         full, error = min(missed + leaves, MOST_ERROR), min(missed + LINKS * shift_error * shift, MOST_ERROR)
     else:
         lever_error, shift_error = add_sighting(kind, lever_error, root, d, moved, factor_errors[f, tl.E_SHIFT])
