@@ -18,7 +18,8 @@ from factorbus.solver.kernels.model.records import graph_at
 
 @pytest.fixture(scope="module")
 def driven() -> Solver:
-    solver = Solver(Options())
+    """Without chord steps, after which a Hessian has another gradient than that of its linearization."""
+    solver = Solver(Options.of(converged_share=1e9, relinearize_same_step_share=1e9))
     for step in manhattan(400, 1):
         solver.stage(step.batch)
         solver.step()

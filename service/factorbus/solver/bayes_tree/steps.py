@@ -42,6 +42,7 @@ _AT_END = 1e-7
 # Of `converged_share`: what a step that follows one that had not converged may gain, and say that it has.
 _STILL = 0.1
 _ASKED = "asked to settle"
+_CORRECTED = "residuals taken anew in a chord step"
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
@@ -298,7 +299,7 @@ class TreeSteps:
         return _new(StepReport, (
             "bayes-tree",
             "batch" if result else ("tree" if moved or relinearized else "extend"),
-            because or (_relinearized(relinearized, rounds) if relinearized else _NOTHING_TO_RELINEARIZE),
+            because or _because(relinearized, rounds, self._tree.state.item(tl.S_CHORDS)),
             result.iterations if result else rounds,
             chi2,
             max(chi2_before, 0.0),
@@ -318,8 +319,10 @@ class TreeSteps:
         ))  # fmt: skip
 
 
-def _relinearized(count: int, rounds: int) -> str:
+def _because(count: int, rounds: int, chords: int) -> str:
     """Why a step did more than solve.  In several rounds one variable counts as often as it was relinearized."""
+    if not count:
+        return _CORRECTED if chords else _NOTHING_TO_RELINEARIZE
     if rounds > 1:
         return f"{counted(count, 'relinearization')} in {rounds} rounds"
     return f"{counted(count, 'variable')} relinearized"

@@ -18,6 +18,7 @@ from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
+QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn with a smaller error is not counted
 NARROW = 16.0  # numbers of R a scalar; where there are more, separators may be further off
 
 

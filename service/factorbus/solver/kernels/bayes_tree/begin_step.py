@@ -45,7 +45,7 @@ def begin_step(graph: Graph, tree: Tree) -> int:
             return tl.UNSURE
     state[tl.S_CHANGED_BEFORE] = state[tl.S_CHANGED]
     state[tl.S_DIFFERING : tl.S_REPORT_END] = 0
-    state[tl.S_FAILED] = -1
+    state[tl.S_FAILED], state[tl.S_CHORDS] = -1, 0
     state[tl.S_STEP] += 1
     state[tl.S_BEGUN] = 1
     return tl.DONE

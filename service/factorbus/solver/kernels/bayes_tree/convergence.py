@@ -1,6 +1,7 @@
 """Whether a step goes on, and what is left to do after it.  MATH §9.6."""
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.chord_step import error_left
 from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_errors
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
@@ -11,6 +12,7 @@ MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
 LARGE_GAIN = 0.05  # of χ², in one round or all,
 AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
+MOST_LEFT = 0.5  # of the Σ error² that is allowed: what a chord step may leave, as it counts as a round
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -36,11 +38,27 @@ def goes_on(weighted_error: float, settings: F64, state: I64, totals: F64) -> bo
 def mark_unconverged(graph: Graph, tree: Tree, settings: F64) -> None:
     """Where Σ error² is more than is allowed, all variables that have a part in it are relinearized next."""
     state, totals = tree.state, tree.totals
-    most = allowed(settings, state, totals)
-    if totals[tl.T_ERROR] > most:
-        least = PASSED_OVER * most / state[tl.S_FACTORS]
-        mark_large_errors(least, graph, tree)
+    if totals[tl.T_ERROR] > allowed(settings, state, totals):
+        mark_large_errors(least_error(settings, state, totals), graph, tree)
         state[tl.S_DUE] = 1
+
+
+@inline_kernel
+def least_error(settings: F64, state: I64, totals: F64) -> float:
+    """The error² of a factor from which on it has a part in Σ error²."""
+    return PASSED_OVER * allowed(settings, state, totals) / state[tl.S_FACTORS]
+
+
+@inline_kernel
+def may_keep_factor(tree: Tree, settings: F64) -> bool:
+    """Whether a chord step may end the step: once, where R is that of Λ and what it corrects is most of Σ error²."""
+    state, totals = tree.state, tree.totals
+    return (
+        state[tl.S_CHORDS] == 0
+        and state[tl.S_CONTINUES] == 0
+        and state[tl.S_RAISED] == 0
+        and error_left(tree) <= MOST_LEFT * allowed(settings, state, totals)
+    )
 
 
 @inline_kernel
@@ -55,7 +73,7 @@ def allowed(settings: F64, state: I64, totals: F64) -> float:
 def converged_error(settings: F64, state: I64, totals: F64) -> float:
     """The Σ error² up to which the step has converged.  (9.32)"""
     chi2 = totals[tl.T_CHI2] + LEAST_CHI2
-    share = settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS], 1)
+    share = settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS] + state[tl.S_CHORDS], 1)
     return share * chi2 * (AFTER_LARGE_GAIN if totals[tl.T_GAINED] > LARGE_GAIN * chi2 else 1.0)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import gather_factors
 from factorbus.solver.kernels.bayes_tree.assemble import give_back_updates, update_orphans
-from factorbus.solver.kernels.bayes_tree.back_substitute import substitute
+from factorbus.solver.kernels.bayes_tree.back_substitute import QUIET, substitute
 from factorbus.solver.kernels.bayes_tree.commit import add_constants, commit
 from factorbus.solver.kernels.bayes_tree.eliminate import eliminate_fronts
 from factorbus.solver.kernels.bayes_tree.fronts import (
@@ -30,7 +30,6 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
 FREE = 0
-QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn with a smaller error is not counted
 
 
 @part

@@ -5,8 +5,9 @@ linear in it.  With a turn of i by φ, and shifts sᵢ and sⱼ in the map's fra
 
     lever error = √ω (½ d φ² + φ |sⱼ − sᵢ|)                                                              (9.4)
 
-standard deviations, ω the largest diagonal entry of Ω for the translation.  Moving the linearization point of i alone
-makes it zero.  A common shift adds no error, however long.  For a bearing and a range the shift counts as well,
+standard deviations at most, ω the largest diagonal entry of Ω for the translation.  Moving the linearization point of i
+alone makes it zero.  A common shift adds no error, however long.  Between poses this says who moves; what counts is
+exact, (9.33) in `missed_residual`.  For a bearing and a range the shift counts as well,
 
     lever error = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d        (9.5)
 
@@ -15,23 +16,23 @@ against the pose, the Jacobian of the pose's turn is off by that share of d, and
 
     shift error = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                  (9.12)
 
-r being the residual at the linearization point.  Between two poses, with the residual r(x) at the estimate,
+r being the residual at the linearization point.  Between two poses, with the residual r(x) at the estimate, and s the
+shift of j as seen from i,
 
-    shift error = √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                    (9.13)
+    shift error = √ω |r(x)| |s| / √(d² + ω_θ/ω)                                                          (9.13)
 
 As a bound it counts in full.  But errors of the gradient largely cancel along a path, so for what is relinearized as
 the drive goes on LINKS of it counts.  Where the shift error is more than the lever error, both ends move.
 
 Angles of the plane add up; turns in space do not.  With ψ the turn of j as seen from i since both were linearized, and
-φ that of i, the vector part of the residual is off by
+φ that of i, the vector part of the residual is off by at most
 
     √ω_θ ψ (½ φ + ψ² / 24)                                                                               (9.26)
 
 ω_θ being the information of the angle: in the Hessian of j, as a residual counts half of it.  And the force √Ω r(x)
-turns with i, and that of the rotation alone, r_θ, with j as seen from i, by half of which the gradient is off on the
-way:
+turns with j as seen from i, by which the gradient is off:
 
-    ½ φ |√Ω r(x)| + ½ ψ |√Ω_θ r_θ(x)|                                                                    (9.30)
+    ψ |√Ω r(x)|                                                                                          (9.30)
 
 That counts as a bound only.  The error of an observation of a camera, and of a factor with a loss, includes that of
 the weight w; it is computed: what the linear model misses of √w r, in standard deviations,
@@ -47,7 +48,6 @@ from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_camera, lens_at
-from factorbus.solver.kernels.model.se3 import quat_product
 from factorbus.solver.lenses.layout import FU
 
 LINKS = 0.1
@@ -105,24 +105,9 @@ def shift_error_weight(root: float, d: float, turn_information: float) -> float:
 
 
 @inline_kernel
-def turn_between(i: int, j: int, values: F64, lin: F64) -> float:
-    """ψ of the poses in space at offsets i and j: by how much j has turned as seen from i."""
-    now = relative_turn(i, j, values)
-    was = relative_turn(i, j, lin)
-    x, y, z, _ = quat_product(-was[0], -was[1], -was[2], was[3], now[0], now[1], now[2], now[3])
-    return 2.0 * math.sqrt(x * x + y * y + z * z)
-
-
-@inline_kernel
 def turn_error(phi: float, psi: float, turn_information: float) -> float:
     """(9.26), the first pose turned by phi; turn_information is ω_θ of the angle."""
     return math.sqrt(turn_information) * psi * (0.5 * phi + psi * psi / 24.0)
-
-
-@inline_kernel
-def relative_turn(i: int, j: int, x: F64) -> tuple:
-    """qᵢ⁻¹ ⊗ qⱼ of the poses at offsets i and j, x y z w."""
-    return quat_product(-x[i + 3], -x[i + 4], -x[i + 5], x[i + 6], x[j + 3], x[j + 4], x[j + 5], x[j + 6])
 
 
 @inline_kernel

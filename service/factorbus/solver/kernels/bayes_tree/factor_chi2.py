@@ -50,7 +50,8 @@ def between_se2_chi2(
     ex, ey = c * tx + s * ty - load(payload, k), c * ty - s * tx - load(payload, k + 1)
     turn = wrap(load(values, y + 2) - load(values, x + 2) - load(payload, k + 2))
     gap = ex * ex + ey * ey
-    if factor_errors[f, tl.E_ISOTROPIC] != 0.0:
+    form = factor_errors[f, tl.E_FORM]
+    if form == tl.ISOTROPIC or form == tl.ISOTROPIC + tl.CORRECTED:
         return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, gap, 0.0
     cz, sz = math.cos(load(payload, k + 2)), math.sin(load(payload, k + 2))
     rx, ry = cz * ex + sz * ey, cz * ey - sz * ex

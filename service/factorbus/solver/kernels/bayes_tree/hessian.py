@@ -37,6 +37,8 @@ def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None
             linearize_rows(graph, tree, f)
         return
     kind, hessian, factor_errors, h = graph.fac[f, at.F_KIND], tree.hessian, tree.factor_errors, tree.link[f, tl.L_AT]
+    if factor_errors[f, tl.E_FORM] >= tl.CORRECTED:
+        factor_errors[f, tl.E_FORM] -= tl.CORRECTED
     more = evaluate_apart(f, graph.var, graph.fac, tree.lin[0], graph.payload, scratch.r, scratch.H[0], scratch.H[1])
     # Sizes as constants, so that each call becomes straight code.
     if kind == at.BETWEEN_SE2:
@@ -252,4 +254,4 @@ def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT] = distance, root
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
         factor_errors[f, tl.E_SHIFT] = shift_error_weight(root, distance, factor_errors[f, tl.E_TURN])
-    factor_errors[f, tl.E_ISOTROPIC] = 1.0 if is_isotropic(kind, fac[f, at.F_AT], payload) else 0.0
+    factor_errors[f, tl.E_FORM] = tl.ISOTROPIC if is_isotropic(kind, fac[f, at.F_AT], payload) else 0.0

@@ -29,9 +29,14 @@ N_NEAR = 12  # the last elimination that looked whether to bring it near the roo
 N_RING = 13  # and the ring in which it did so; 0: the outermost; −1: it did not
 N_WIDTH = 16
 
-# Columns of `factor_errors`: d, √ω, |Ω r| or what (9.13) is by the shift and |r|, ω_θ, 1 for a translation whose Ω is
-# isotropic and not coupled to the angle; χ² at the estimate, error² in full, and as it counts.
-E_LEVER, E_ROOT, E_SHIFT, E_TURN, E_ISOTROPIC, E_CHI2, E_ERROR, E_COUNTED, E_WIDTH = 0, 1, 2, 3, 4, 5, 6, 7, 8
+# Columns of `factor_errors`, a cache line of what every evaluation looks at: d, √ω, |Ω r| or what (9.13) is by shift
+# and |r|, the sum of ISOTROPIC and CORRECTED; at the estimate χ², error² in full, what a chord step leaves of it, and
+# error² as it counts.
+E_LEVER, E_ROOT, E_SHIFT, E_FORM, E_CHI2, E_ERROR, E_LEAVES, E_COUNTED = range(8)
+# And one of the rest: ω_θ; what (9.33) and (9.34) were where a chord step corrected the model, 6 numbers.
+E_TURN, E_MISSED, E_WIDTH = 8, 9, 16
+# In E_FORM: Ω of a translation is isotropic and not coupled to the angle; a chord step has corrected the linear model.
+ISOTROPIC, CORRECTED = 1.0, 2.0
 
 # Columns of `turns`.
 U_LEVER, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 4
@@ -139,7 +144,8 @@ S_AFTER = 55  # why more than the step is to be done: sums of WORSE, ROSE, RAISE
 S_EDITED = 56  # variables in `moved` whose factors were edited since the last step; they come first
 S_EDITED_AT = 57  # the last step that such factors went before
 S_HOLES = 58  # doubles of `hessian` that no factor has any more
-S_FREE = 59  # heads of free lists: numbers, then lists
+S_CHORDS = 59  # chord steps of the step
+S_FREE = 60  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 

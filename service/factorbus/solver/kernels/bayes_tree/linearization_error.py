@@ -16,12 +16,12 @@ from factorbus.solver.kernels.bayes_tree.error_terms import (
     add_observation,
     lever_error_of,
     shift_between,
-    turn_between,
     turn_error,
     turn_of,
 )
 from factorbus.solver.kernels.bayes_tree.exact_error import exact_error
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import any_chi2, chi2_of_factor, heading_of
+from factorbus.solver.kernels.bayes_tree.missed_residual import missed_error_se2, missed_error_se3
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, STAYED
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.relinearize import WAITS
@@ -46,7 +46,6 @@ MUCH = 8  # where more than one variable in this number has moved, all factors a
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
 ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
-FORCE = 0.5  # of φ |√Ω r| and ψ |√Ω_θ r_θ|, (9.30)
 MOST_ERROR = 1e100  # of a factor: its square is still a number
 
 
@@ -176,7 +175,7 @@ def evaluate_factor(
     """
     var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
     node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
-    lin, delta, error, full = tree.lin[0], tree.scalars[0], 0.0, 0.0
+    lin, delta, error, full, leaves = tree.lin[0], tree.scalars[0], 0.0, 0.0, 0.0
     kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
     if not is_bounded(kind) or kind == at.PRIOR_SE3 or loss_code(f, fac) != at.NO_LOSS:
         if how < MODEL:
@@ -185,13 +184,13 @@ def evaluate_factor(
             error, force, chi2 = exact_error(f, var, fac, lin, values, payload, delta)
             error = min(error, MOST_ERROR)
             full = min(error + force, MOST_ERROR)
-            full = ROBUST * full if loss_code(f, fac) != at.NO_LOSS else full
+            leaves = full = ROBUST * full if loss_code(f, fac) != at.NO_LOSS else full
             if error > threshold:
                 mark_ends_pending(f, fac, var, node, pending, state)
     else:
-        chi2, gap, turned = chi2_of_factor(graph, tree, f, kind, c, s)
+        chi2, gap, _ = chi2_of_factor(graph, tree, f, kind, c, s)
         if second >= 0 and how == MODEL:
-            error, full = error_of(graph, tree, f, v, threshold, gap, chi2, turned)
+            error, full, leaves = error_of(graph, tree, f, v, threshold, gap, chi2)
     was = factor_errors[f, tl.E_CHI2]
     factor_errors[f, tl.E_CHI2] = chi2
     if how < MODEL:
@@ -199,53 +198,77 @@ def evaluate_factor(
     full, counted = full * full, error * error if error > threshold else 0.0
     full_before, counted_before = factor_errors[f, tl.E_ERROR], factor_errors[f, tl.E_COUNTED]
     factor_errors[f, tl.E_ERROR], factor_errors[f, tl.E_COUNTED] = full, counted
+    factor_errors[f, tl.E_LEAVES] = leaves * leaves
     size = chi2 + was + full + full_before
     return error, chi2 - was, size, full - full_before, counted - counted_before
 
 
 @inline_kernel
 def error_of(
-    graph: Graph, tree: Tree, f: int, v: int, threshold: float, gap: float, chi2: float, turned: float
-) -> tuple[float, float]:
-    """How far factor f, whose first variable is v, is from its linear model, as it counts and in full.  Where
-    that is more than `relinearize_threshold`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
+    graph: Graph, tree: Tree, f: int, v: int, threshold: float, gap: float, chi2: float
+) -> tuple[float, float, float]:
+    """How far factor f, whose first variable is v, is from its linear model: as it counts, in full, and what of that a
+    chord step leaves.  Between poses v waits where (9.4) is more than `relinearize_threshold`, else where the error is.
+
+    Between poses in space (9.4) and (9.26) stand for (9.33) and (9.34) where they are below that threshold.
     """
     var, values, kind, second = graph.var, graph.values, graph.fac[f, at.F_KIND], graph.fac[f, at.F_J]
     node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
     lin, delta = tree.lin[0], tree.scalars[0]
     x, y, planar, free = var[v, at.V_AT], var[second, at.V_AT], var[v, at.V_KIND] == at.SE2, var[v, at.V_COLUMN] >= 0
     phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
-    d, root, shift = factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT], shift_between(planar, x, y, values, lin)
-    lever_error = lever_error_of(root, d, phi, shift)
+    d, root, moved = factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT], shift_between(planar, x, y, values, lin)
+    lever_error = lever_error_of(root, d, phi, moved)
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
-        shift_error, force = factor_errors[f, tl.E_SHIFT] * math.sqrt(gap) * shift, 0.0
-        if kind == at.BETWEEN_SE3:
-            psi = turn_between(x, y, values, lin)
-            lever_error += turn_error(phi, psi, factor_errors[f, tl.E_TURN])
-            force = FORCE * (phi * math.sqrt(chi2) + psi * math.sqrt(max(turned, 0.0)))
-        full, error = (
-            min(lever_error + shift_error + force, MOST_ERROR),
-            min(lever_error + LINKS * shift_error, MOST_ERROR),
-        )
-        both = LINKS * shift_error > lever_error
+        shift_error = factor_errors[f, tl.E_SHIFT] * math.sqrt(gap)
+        bound = lever_error + LINKS * shift_error * moved
+        both, marks = LINKS * shift_error * moved > lever_error, bound > threshold
+        if kind == at.BETWEEN_SE2:
+            missed, shift, psi = missed_error_se2(graph, tree, f)
+        else:
+            turn = phi + (turn_of(at.SE3, delta, var[second, at.V_SCALAR]) if var[second, at.V_COLUMN] >= 0 else 0.0)
+            missed, shift, psi = lever_error + turn_error(phi, turn, factor_errors[f, tl.E_TURN]), moved, turn
+            if marks or missed > threshold or factor_errors[f, tl.E_FORM] >= tl.CORRECTED:
+                missed, shift, psi = missed_error_se3(graph, tree, f)
+        leaves = min(shift_error * shift + psi * math.sqrt(chi2), MOST_ERROR)
+        full, error = min(missed + leaves, MOST_ERROR), min(missed + LINKS * shift_error * shift, MOST_ERROR)
     else:
-        lever_error, shift_error = add_observation(kind, lever_error, root, d, shift, factor_errors[f, tl.E_SHIFT])
-        full = error = min(SEEN * (lever_error + shift_error), MOST_ERROR)
+        lever_error, shift_error = add_observation(kind, lever_error, root, d, moved, factor_errors[f, tl.E_SHIFT])
+        full = error = leaves = min(SEEN * (lever_error + shift_error), MOST_ERROR)
         both = kind == at.BEARING_RANGE_SE2 or shift_error > lever_error
-    if error > threshold:
+        marks = error > threshold
+    if marks:
         if free:
             mark_pending(v, node, pending, state)
         if (both or not free) and var[second, at.V_COLUMN] >= 0:
             mark_pending(second, node, pending, state)
-    return error, full
+    return error, full, leaves
 
 
 @part
 def mark_large_errors(least: float, graph: Graph, tree: Tree) -> None:
     """The variables of all factors whose error² in full is more than `least` wait."""
+    var, fac = graph.var, graph.fac
     for f in range(tree.state[tl.S_FACTORS]):
-        if tree.factor_errors[f, tl.E_ERROR] > least:
-            mark_ends_pending(f, graph.fac, graph.var, tree.node, tree.pending, tree.state)
+        if tree.factor_errors[f, tl.E_ERROR] > least or moves_far(f, least, graph, tree):
+            mark_ends_pending(f, fac, var, tree.node, tree.pending, tree.state)
+
+
+@inline_kernel
+def moves_far(f: int, least: float, graph: Graph, tree: Tree) -> bool:
+    """Whether (9.4) and (9.13) of a factor between poses come to more than `least`, squared, though its model may miss
+    less: one that is left behind where its neighbours are relinearized misses as much as they have shifted.
+    """
+    var, row, kind, second = graph.var, tree.factor_errors[f], tree.link[f, tl.L_KIND], graph.fac[f, at.F_J]
+    if kind != at.BETWEEN_SE2 and kind != at.BETWEEN_SE3:
+        return False
+    v, root = graph.fac[f, at.F_I], row[tl.E_ROOT]
+    d = var[v, at.V_SCALAR]
+    phi = turn_of(var[v, at.V_KIND], tree.scalars[0], d) if d >= 0 else 0.0
+    shift = shift_between(kind == at.BETWEEN_SE2, var[v, at.V_AT], var[second, at.V_AT], graph.values, tree.lin[0])
+    gap = math.sqrt(max(row[tl.E_CHI2], 0.0)) / root if root > 0.0 else 0.0
+    error = lever_error_of(root, row[tl.E_LEVER], phi, shift) + row[tl.E_SHIFT] * gap * shift
+    return error * error > least
 
 
 @inline_kernel

@@ -20,9 +20,10 @@ class Tree(NamedTuple):
                              before the step, of what it changes
     scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
                              back to while variables are relinearized
-    factor_errors (m, 8) float64   of each factor d and √ω, (9.4); of a landmark |Ω r| where it was linearized, (9.12);
+    factor_errors (m, 16) float64  of each factor d and √ω, (9.4); of a landmark |Ω r| where it was linearized, (9.12);
                              between poses ω_θ, and what (9.13) is by |r| and the shift; whether its Ω is isotropic for
-                             the translation; at the estimate χ², error² in full, and as it counts
+                             the translation; at the estimate χ², error² in full, and as it counts; what a chord step
+                             has corrected its model by
     turns   (n, 4) float64   of each variable: the largest d √ω of what it sees; cosine and sine where a plane pose is
                              linearized
     pending, changed, moved  (n,) int64   variables: that wait to be relinearized; that the step changed; that moved

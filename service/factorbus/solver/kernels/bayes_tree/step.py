@@ -11,7 +11,8 @@
 7  commit         new cliques and numbers take the place of the old ones
 8  substitute     back down from the new roots, as far as anything changes
 9  measure        χ² at the estimate, and how far factors are from their linear models
-10 again from 2   while that is so far that it cannot wait
+10 correct        models and right-hand sides where that is so far that it cannot wait, with R as it is, and 8 and 9
+11 again from 2   while it is so far still
 A step with nothing new goes on from 2 with what waits, and substitutes back through the whole tree.
 """
 
@@ -19,7 +20,14 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import take_in_factors, take_in_variables, take_out
 from factorbus.solver.kernels.bayes_tree.begin_step import begin_step
 from factorbus.solver.kernels.bayes_tree.changed_variables import count_differing
-from factorbus.solver.kernels.bayes_tree.convergence import goes_on, mark_unconverged, note_after
+from factorbus.solver.kernels.bayes_tree.chord_step import chord_step
+from factorbus.solver.kernels.bayes_tree.convergence import (
+    goes_on,
+    least_error,
+    mark_unconverged,
+    may_keep_factor,
+    note_after,
+)
 from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, lap
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearize
@@ -97,6 +105,12 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
             break
         if state[tl.S_WAIT] != 0 or not goes_on(weighted_error, scaled, state, totals):
             break
+        if may_keep_factor(tree, scaled):
+            weighted_error = chord_step(least_error(scaled, state, totals), graph, tree, scaled)
+            began = cycles()
+            totals[tl.T_GAINED] = max(totals[tl.T_GAINED], chi2 - totals[tl.T_CHI2])
+            if totals[tl.T_CHI2] <= chi2 and not goes_on(weighted_error, scaled, state, totals):
+                break
         mark_unconverged(graph, tree, scaled)
     changed = tree.changed[: state[tl.S_CHANGED]]
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
