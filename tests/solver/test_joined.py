@@ -34,6 +34,8 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.why import why_variable
 from factorbus.solver.graph.groups import FactorGroup
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.sparse.anchors import find_undetermined
 
 
 @pytest.mark.parametrize(
@@ -298,3 +300,27 @@ def _steps(poses: int, keep: int) -> Iterator[Batch]:
             cut = np.ptp(g.keys, axis=1) <= keep
             near.append(g._replace(keys=g.keys[cut], measured=g.measured[cut], information=g.information[cut]))
         yield step.batch._replace(factors=tuple(g for g in near if len(g.keys)))
+
+
+@pytest.mark.parametrize("kind", SIZE)
+def test_a_long_drive_is_held_by_the_marginal_of_what_held_it(kind: str) -> None:
+    """What is known of where it begins is in a factor of two poses then: they are held together, the rest by them."""
+    poses, d = 300, TANGENT[kind]
+    ahead = [np.zeros(SIZE[kind]) for _ in range(2)]
+    for n, z in enumerate(ahead):
+        z[0] = n + 1.0
+        z[6:] = 1.0
+    sigmas = np.diag(np.full(d, 1e4))[np.triu_indices(d)][None]
+    at_all = np.zeros((poses, SIZE[kind]))
+    at_all[:, 0] = np.arange(poses)
+    at_all[:, 6:] = 1.0
+    factors = [Factors(f"prior_{kind}", x(0)[None], at_all[:1], sigmas)]
+    for n, z in enumerate(ahead):
+        keys = np.stack([x(*range(poses - n - 1)), x(*range(n + 1, poses))], axis=1)
+        factors.append(Factors(f"between_{kind}", keys, np.tile(z, (len(keys), 1)), np.tile(sigmas, (len(keys), 1))))
+    solver = solved(Batch((Variables(kind, x(*range(poses)), at_all),), tuple(factors)))
+    after, *_ = with_changes(solver, marginalize(0), settle=True)
+    assert [g.keys.tolist() for g in after.graph()[1] if g.kind.startswith("linear")] == [[x(1, 2).tolist()]]
+    assert not find_undetermined(graph_in(after), (0,) * at.COUNTS).size, "nothing is left to the numbers"
+    again, *_ = with_changes(after, [Change("fix", keys=x(9))])
+    assert apart(again, solver) < 1e-9

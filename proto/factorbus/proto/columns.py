@@ -122,7 +122,7 @@ def _read_factors(index: int, content: Map) -> Factors:
     kind = content.get("kind")
     known = FACTOR_KINDS.get(kind) if type(kind) is str else None
     if known is None:
-        raise _kind_problem(place(), content, FACTOR_KINDS.names())
+        raise _kind_problem(place(), content, FACTOR_KINDS.names(kind if type(kind) is str else ""))
     keys = fields.keys(place, content, len(known.connects))
     measured = fields.rows(place, content, "measured", len(keys), known.size)
     information = fields.rows(place, content, "information", len(keys), known.information_size)

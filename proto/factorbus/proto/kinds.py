@@ -103,6 +103,7 @@ VARIABLE_KINDS = {
 MOST_JOINED = 128
 LINEAR_NAME = "linear_ROWS_KIND_KIND..."
 _LINEAR = "linear_"
+_LONGEST = len("linear_1000") + MOST_JOINED * len("_vector9")  # characters of such a name
 _LINEAR_FORM = re.compile(r"linear_([1-9][0-9]{0,3})((?:_[a-z0-9]+)+)")
 _PLANE, _SPACE = {"se2", "point2"}, {"se3", "point3", "idp"}
 
@@ -130,15 +131,22 @@ def linear_kind(rows: int, ends: tuple[str, ...]) -> FactorKind:
     return FactorKind(name, ends, size, rows, measured, "Σ Hₙ (xₙ ⊟ yₙ) + b", (*y, *[0.25] * (size - values)))
 
 
-@lru_cache(maxsize=1024)
 def _linear_of_name(name: str) -> FactorKind | None:
     """The linear kind of that name; None: there is none."""
-    if (found := _LINEAR_FORM.fullmatch(name)) is None:
+    if not name.startswith(_LINEAR) or len(name) > _LONGEST:
         return None
     try:
-        return linear_kind(int(found[1]), tuple(found[2][1:].split("_")))
+        return _read_linear(name)
     except ValueError:
         return None
+
+
+@lru_cache(maxsize=1024)
+def _read_linear(name: str) -> FactorKind:
+    """Raises ValueError: why there is no linear kind of that name."""
+    if (found := _LINEAR_FORM.fullmatch(name)) is None:
+        raise ValueError("wanted a number of rows from 1 on, and the kind of each variable")
+    return linear_kind(int(found[1]), tuple(found[2][1:].split("_")))
 
 
 class FactorKinds(dict[str, FactorKind]):
@@ -158,8 +166,18 @@ class FactorKinds(dict[str, FactorKind]):
         found = super().get(name)
         return found or _linear_of_name(name) or default
 
-    def names(self) -> tuple[str, ...]:
-        """For a person: all names, and the form of those of linear factors."""
+    def names(self, unknown: str = "") -> tuple[str, ...]:
+        """For a person: all names, and the form of those of linear factors.
+
+        Of an `unknown` one that begins as these do, what is wrong with it.
+        """
+        if unknown.startswith(_LINEAR):
+            if len(unknown) > _LONGEST:
+                return (f"{LINEAR_NAME}, of up to {MOST_JOINED} variables",)
+            try:
+                _read_linear(unknown)
+            except ValueError as why:
+                return (f"{LINEAR_NAME} ({why})",)
         return (*self, LINEAR_NAME)
 
 

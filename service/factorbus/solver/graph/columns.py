@@ -162,7 +162,7 @@ def _iter_rows(variables: int, form: tuple[Any, ...]) -> Iterator[tuple[int, ...
         name, loss, keys, measured, information, scale = form[k : k + 6]
         kind = FACTOR_KINDS.get(name)
         if kind is None:
-            raise errors.UnknownKind("factor", name, WIRE_KINDS.names())
+            raise errors.UnknownKind("factor", name, WIRE_KINDS.names(name))
         _check(keys, _I64, (-1, len(kind.connects)), name, "keys")
         count = keys[1][0]
         _check(measured, _F64, (count, kind.size), name, "measured")

@@ -12,6 +12,7 @@ import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.graph.factor_rows import rows_of_factors
+from factorbus.solver.graph.linearized import linearized_factor
 from factorbus.solver.kernels.graph.initialize import join, reach
 from factorbus.solver.kernels.graph.observability import mark_determined
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -20,6 +21,8 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 
 # A variance this many times what the variable's own factors alone would leave is no longer a number.
 _LOOSE = 1e12
+# The share of its diagonal that the least known direction of a linear factor has to keep, for it to determine.
+_ROOM = 1e-8
 _NONE = np.empty(0, np.int64)
 
 
@@ -32,11 +35,29 @@ def find_undetermined(graph: FactorGraph, since: Mark) -> I64:
     factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
     arenas = graph.var, graph.fac, graph.values, graph.payload
     while reach(False, first, *factors, graph.array_table, determined) >= 0:
-        if not mark_determined(first, *factors, *arenas, determined):
+        if not mark_determined(first, *factors, *arenas, determined) and not _mark_together(graph, since, determined):
             break
     else:
         return _NONE
     return first + np.flatnonzero(determined == 0)
+
+
+def _mark_together(graph: FactorGraph, since: Mark, determined: I64) -> bool:
+    """Set to 1 in `determined` what one linear factor determines with several variables together, as a marginal of the
+    map's anchor does; gives whether there is any."""
+    first, found = since[at.VARIABLES], False
+    fac = graph.fac[since[at.FACTORS] : graph.counts[at.FACTORS]]
+    for row in (since[at.FACTORS] + np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR)).tolist():
+        loose = [v for v in graph.ends_of(row) if v >= first and not determined[v - first]]
+        scalars = int(graph.dims[graph.var[loose, at.V_COLUMN]].sum())
+        if len(loose) > 1 and graph.kind_of(row).dim >= scalars:
+            linear = linearized_factor(graph, row)
+            J = np.hstack([linear.jacobian_of(v) for v in loose])
+            information = J.T @ linear.W @ J
+            D = np.sqrt(information.diagonal())
+            if (D > 0.0).all() and np.linalg.eigvalsh(information / D / D[:, None])[0] > _ROOM:
+                determined[np.array(loose) - first], found = 1, True
+    return found
 
 
 def find_unanchored(graph: FactorGraph, since: Mark) -> int:
