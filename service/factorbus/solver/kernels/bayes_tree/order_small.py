@@ -19,9 +19,10 @@ from factorbus.solver.kernels.bayes_tree.records import Fronts, Tree
 from factorbus.solver.kernels.jit.bit_sets import count_bits, highest_bit, lowest_bit
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 from factorbus.solver.kernels.model.records import Graph
+from factorbus.solver.kernels.model.sizes import MOST_SCALARS
 
 NONE = -1
-PLANES = 3  # binary digits of how many scalars a variable has
+PLANES = MOST_SCALARS.bit_length()  # binary digits of how many scalars a variable has
 
 
 @part
@@ -117,7 +118,10 @@ def first_group(left: int, group: I64) -> int:
 @inline_kernel
 def scalars_in(word: int, planes: I64) -> int:
     """How many scalars these variables have; planes: who has a 1 in each binary digit of it."""
-    return count_bits(word & planes[0]) + 2 * count_bits(word & planes[1]) + 4 * count_bits(word & planes[2])
+    total = 0
+    for p in range(PLANES):
+        total += count_bits(word & planes[p]) << p
+    return total
 
 
 @part
