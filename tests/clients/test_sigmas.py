@@ -252,7 +252,7 @@ def test_every_method_that_takes_a_certainty_is_among_them() -> None:
         if not name.startswith("_") and any(p.kind is kinds for p in inspect.signature(method).parameters.values())
     }
     # An inverse-depth feature has a certainty of its own, `FeatureCertainty`; a variable has none (`Held`).
-    assert takes - {"idp_first", "variable", *VARIABLE_KINDS} == set(EVERY_METHOD)
+    assert takes - {"idp_first", "variable", "vector", *VARIABLE_KINDS} == set(EVERY_METHOD)
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)

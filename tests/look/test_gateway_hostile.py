@@ -13,8 +13,6 @@ from processes import Process
 
 from factorbus.client import Draft, connect
 from factorbus.gateway.documents import Document
-from factorbus.gateway.explain import explain
-from factorbus.proto.asking import Why
 from factorbus.proto.problems import BadSymbol
 from factorbus.proto.symbols import MAX_KEY, MIN_KEY, parse_symbol
 
@@ -145,21 +143,3 @@ def test_numbers_too_long_to_read_are_no_keys(text: str) -> None:
 def test_what_is_no_number_is_null_in_a_document() -> None:
     made = Document({"a": [1.0, np.inf, {"b": float("nan")}], "c": -0.5})
     assert json.loads(made.body) == {"a": [1.0, None, {"b": None}], "c": -0.5}
-
-
-def test_a_piece_of_negative_weight_is_explained() -> None:
-    factor = {
-        "factor": 1,
-        "kind": "linear_3_se2",
-        "keys": [7],
-        "chi2": -4.0,
-        "dims": 3,
-        "influence": 0.0,
-        "without": None,
-        "loss": "",
-        "weight": 1.0,
-        "rho": -4.0,
-    }
-    explained = {"key": 7, "kind": "se2", "value": [0.0] * 3, "fixed": False, "sigmas": [1.0] * 3, "conditioning": 1.0,
-               "factors": [factor], "pivot": 1.0, "linearized_step": 1, "changed_step": 1, "seen_step": 1}  # fmt: skip
-    assert explain(Why(1, 1, explained, {}, {}))["factors"][0]["misfit"] == 0.0

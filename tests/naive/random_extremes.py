@@ -125,8 +125,8 @@ class Extremes:
         kinds = rng.choice(list(SIZES), int(rng.integers(0, 3)), replace=False)
         variables = tuple(self._variable(str(kind), fixed=False) for kind in kinds)
         new = {group.kind: int(group.keys[0]) for group in variables}
-        factors = [self._factor(f"prior_{kind}", new) for kind in new if kind != "idp" and rng.random() < 0.7]
-        factors += [self._factor("linear_6_idp", new) for kind in new if kind == "idp" and rng.random() < 0.7]
+        alone = [f"prior_{kind}" if f"prior_{kind}" in FACTOR_KINDS else f"linear_{SIZES[kind]}_{kind}" for kind in new]
+        factors = [self._factor(kind, new) for kind in alone if rng.random() < 0.7]
         factors += [
             self._factor(str(kind), new) for kind in rng.choice([*FACTOR_KINDS, *LINEAR], int(rng.integers(0, 4)))
         ]

@@ -9,6 +9,7 @@ import pytest
 
 from factorbus.proto import asking_codec, codec
 from factorbus.proto.asking import AskAssociate, AskCovariance, AskGain, AskGate, AskRepair, AskWhy
+from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import Problem, TooLarge
 from factorbus.proto.repair_codec import encode_ask_repair
@@ -124,7 +125,7 @@ def test_many_keys_are_refused_before_r_is_copied(solver: Solver, count: int, mo
     for keys in (np.arange(count), np.zeros(count, np.int64)):
         problem = refused(solver, "covariance", ask_joint(keys), Room(answer_bytes=64 << 20))
         assert (problem.code, problem.detail["limit"]) == ("too_large", 64 << 20)
-        assert problem.detail["size"] >= 8 * (2 * count) ** 2
+        assert problem.detail["size"] >= 8 * (min(kind.dim for kind in VARIABLE_KINDS.values()) * count) ** 2
 
 
 def test_keys_that_are_given_again_count_again(solver: Solver) -> None:

@@ -71,4 +71,4 @@ def test_a_loop_with_values_half_a_turn_off(
         Batch((pose(X[2]),), (edge(1, 2, half),)),
         Batch((pose(X[3]),), (edge(2, 3, none), edge(0, 3, half))),
     ]
-    assert finished(batches, mode).chi2() < 1e-12
+    assert finished(batches, mode).chi2() < 1e-10, "of 0 at the optimum"

@@ -68,7 +68,7 @@ def test_it_refuses_before_the_limit_and_takes_again_after_a_drop(tmp_path: Path
         assert stats["maps"][0]["refusals"] == {"out_of_memory": 1}
         assert sum(len(group.keys) for group in first.ask_estimate().variables) == taken * POSES
         before = resident(stats["pid"])
-        for count, code in ((1000, "out_of_memory"), (4000, "too_large"), (1_000_000, "too_large")):
+        for count, code in ((1000, "out_of_memory"), (8000, "too_large"), (1_000_000, "too_large")):
             with pytest.raises(Refused) as no_room:
                 first.uncertainty.joint(np.arange(count) % 3000)  # keys, some of them again and again
             assert no_room.value.code == code

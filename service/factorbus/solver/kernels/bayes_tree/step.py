@@ -58,7 +58,8 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     graph, tree = graph_at(graph_table), tree_at(tree_table)
     settings, state, totals = tree.settings, tree.state, tree.totals
     v1, f1 = graph.counts[at.VARIABLES], graph.counts[at.FACTORS]
-    if state[tl.S_BEGUN] == 0:
+    goes_on_with_it = state[tl.S_BEGUN] != 0  # after NO_ROOM: what moves was marked, and is linearized
+    if not goes_on_with_it:
         if len(tree.clique) > tree.marked.size:
             return tl.NO_ROOM
         status = begin_step(graph, tree)
@@ -66,7 +67,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
             return status
         note_before(v1, f1, state, totals)
     scaled = scale_thresholds(f1, graph.counts[at.SCALARS], settings, state, totals)
-    if state[tl.S_CONTINUES] != 0:
+    if state[tl.S_CONTINUES] != 0 and not goes_on_with_it:
         mark_unconverged(graph, tree, scaled)
     v0 = state[tl.S_FIRST_NEW]
     take_in_variables(v1, graph.var, graph.values, tree.node, tree.lin, tree.scalars, tree.turns, state)
