@@ -8,14 +8,15 @@ import pytest
 from naive.dense_least_squares import full
 from naive.random_graphs import camera_steps
 from naive.random_others import other_steps
-from naive.solver_parts import graph_in
+from naive.solver_parts import graph_in, row_count
 from naive.tree_records import tree_of
 
 from factorbus.solver import Options, Solver
+from factorbus.solver.graph.factor_rows import are_of_many, is_first
 from factorbus.solver.kernels.bayes_tree.exact_error import exact_error
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.candidates import evaluate_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
-from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 
 FAR = Options.of(
     relinearize_next_step_share=1e9,
@@ -34,37 +35,39 @@ def test_error_and_force_are_those_of_the_definition(world: str) -> None:
         solver.stage(batch)
         solver.step()
     graph, tree, seen = graph_in(solver), tree_of(solver), 0
-    for f in range(solver.factor_count):
-        kind = int(graph.fac[f, at.F_KIND])
-        dim = residual_dim(kind)
-        lin, now = (evaluated(graph, f, values) for values in (tree.lin[0], graph.values))
-        if lin[0][at.R_STATUS] != now[0][at.R_STATUS]:
+    for f in np.flatnonzero(is_first(graph.fac[: row_count(solver)])).tolist():
+        (r, was, weight, _), (now, here, _, more) = (evaluated(graph, f, of) for of in (tree.lin[0], graph.values))
+        if not are_of_many(graph.fac[f : f + 1])[0] and r[at.R_STATUS] != now[at.R_STATUS]:
             continue  # an observation that lost its pixel or found it again
-        p = int(graph.fac[f, at.F_AT] + information_at(kind))
-        weight = full(graph.payload[p : p + dim * (dim + 1) // 2])
-        model, force = lin[0][:dim].copy(), 0.0
-        for end in range(2):
-            v = int(graph.fac[f, at.F_I + end])
-            if v < 0 or graph.var[v, at.V_SCALAR] < 0:
+        dim = len(weight)
+        model, force = r[:dim].copy(), 0.0
+        for end, v in enumerate(graph.ends_of(f)):
+            if graph.var[v, at.V_SCALAR] < 0:
                 continue
-            size, start = dim_of(int(graph.var[v, at.V_KIND])), int(graph.var[v, at.V_SCALAR])
-            was, here = lin[1 + end][:dim, :size], now[1 + end][:dim, :size]
-            model += was @ tree.scalars[0][start : start + size]
-            turned, diagonal = (here - was).T @ weight @ now[0][:dim], np.diag(here.T @ weight @ here)
+            start, J, J_now = int(graph.var[v, at.V_SCALAR]), was[end], here[end]
+            model += J @ tree.scalars[0][start : start + J.shape[1]]
+            turned, diagonal = (J_now - J).T @ weight @ now[:dim], np.diag(J_now.T @ weight @ J_now)
             force += float(np.sum(turned[diagonal > 0] ** 2 / diagonal[diagonal > 0]))
-        gap = now[0][:dim] - model
+        gap = now[:dim] - model
         error, told, chi2 = exact_error(
             f, graph.var, graph.fac, tree.lin[0], graph.values, graph.payload, tree.scalars[0]
         )
         assert error == pytest.approx(np.sqrt(max(gap @ weight @ gap, 0.0)), rel=1e-6, abs=1e-7)
         assert told == pytest.approx(np.sqrt(force), rel=1e-7, abs=1e-9)
-        assert chi2 == pytest.approx(now[3] + now[0][:dim] @ weight @ now[0][:dim], rel=1e-9, abs=1e-12)
+        assert chi2 == pytest.approx(more + now[:dim] @ weight @ now[:dim], rel=1e-9, abs=1e-12)
         seen += told > 1e-6
     assert seen > 5
 
 
-def evaluated(graph, f: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """r, A, B, and what χ² has beside rᵀΩr."""
+def evaluated(graph, f: int, values: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray, float]:
+    """r, the Jacobians, Ω, and what χ² has beside rᵀΩr."""
+    dim, dims = graph.kind_of(f).dim, [end.dim for end in graph.kind_of(f).connects]
+    p = int(graph.fac[f, at.F_AT] + graph.kind_of(f).size)
+    weight = full(graph.payload[p : p + dim * (dim + 1) // 2])
+    if are_of_many(graph.fac[f : f + 1])[0]:
+        r, J, W = np.empty(dim), np.empty((dim, sum(dims))), np.empty((dim, dim))
+        evaluate_many(f, graph.array_table, values, r, J, W)
+        return r, np.split(J, np.cumsum(dims)[:-1], axis=1), weight, 0.0
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     more = evaluate_apart(f, graph.var, graph.fac, values, graph.payload, r, A, B)
-    return r, A, B, more
+    return r, [J[:dim, :d] for J, d in zip((A, B), dims, strict=False)], weight, more

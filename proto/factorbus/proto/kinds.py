@@ -121,8 +121,8 @@ def linear_kind(rows: int, ends: tuple[str, ...]) -> FactorKind:
     values, scalars = sum(kind.size for kind in kinds), sum(kind.dim for kind in kinds)
     if not (1 <= len(ends) <= MOST_JOINED and 1 <= rows <= scalars + 1):
         raise ValueError(
-            f"{counted(rows, 'row')} on {counted(len(ends), 'variable')}; wanted 1 to {MOST_JOINED} variables, and rows "
-            f"for as many scalars as these have, and one more: 1 to {scalars + 1}"
+            f"{counted(rows, 'row')} on {counted(len(ends), 'variable')}; wanted 1 to {MOST_JOINED} variables, and "
+            f"a row for each of their scalars, and one more: 1 to {scalars + 1}"
         )
     size = values + rows * scalars + rows
     y = [number for kind in kinds for number in (*[0.0] * (kind.size - 1), 1.0)]
