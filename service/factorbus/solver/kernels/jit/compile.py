@@ -17,7 +17,8 @@ rule for that one.
 No slice or row is assigned an array, and none is sorted by NumPy's way: to compile what the one says of unlike sizes,
 and the other, takes three seconds in each process.
 
-An index is 0 or more, or a constant that is written where it is used, as in `a[-1]`; ends of slices may be anything.
+An index is 0 or more, or a constant that is written where it is used, as in `a[-1]` and `a[-1, k]`, but not in
+`a[-1, 1:]`, which is refused; ends of slices may be anything.
 Python counts other negative ones from the end; a kernel does not look for them, which saves a twentieth of a step.
 With every index checked they are errors.
 
