@@ -380,7 +380,6 @@ def test_a_documented_field_of_a_report_can_always_be_asked_for() -> None:
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
-        ("linear_3_se2_point3", "wanted none of space beside se2 and point2"),
         ("linear_9_se2", "one more: 1 to 4"),
         ("linear_0_se2", "a number of rows from 1 on"),
         ("linear_3_velocity", "'velocity' is no kind of variable"),

@@ -40,7 +40,8 @@ WRITABLE = (
     "bearing_se2",
 )
 UNWRITABLE = [name for name in FACTOR_KINDS if name not in WRITABLE]
-WRITABLE_VARIABLES = {name: kind for name, kind in VARIABLE_KINDS.items() if name != "idp"}
+# No record is there for the others.
+WRITABLE_VARIABLES = {name: VARIABLE_KINDS[name] for name in ("se2", "se3", "point2", "point3")}
 NUMBERS = st.floats(-1e9, 1e9) | st.sampled_from([0.0, -0.0, 5e-324, 1.7e308, 1 / 3])
 
 

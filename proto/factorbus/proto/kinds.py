@@ -105,18 +105,15 @@ LINEAR_NAME = "linear_ROWS_KIND_KIND..."
 _LINEAR = "linear_"
 _LONGEST = len("linear_1000") + MOST_JOINED * len("_vector9")  # characters of such a name
 _LINEAR_FORM = re.compile(r"linear_([1-9][0-9]{0,3})((?:_[a-z0-9]+)+)")
-_PLANE, _SPACE = {"se2", "point2"}, {"se3", "point3", "idp"}
 
 
 def linear_kind(rows: int, ends: tuple[str, ...]) -> FactorKind:
-    """The kind of linear factors with these rows and kinds of variables: of the plane or of space, and vectors.
+    """The kind of linear factors with these rows and kinds of variables.
 
-    Raises ValueError: no such kind of variable, kinds of the plane and of space, or too many rows or variables.
+    Raises ValueError: no such kind of variable, or too many rows or variables.
     """
     if unknown := [end for end in ends if end not in VARIABLE_KINDS]:
         raise ValueError(f"{unknown[0]!r} is no kind of variable; wanted {', '.join(VARIABLE_KINDS)}")
-    if _PLANE.intersection(ends) and _SPACE.intersection(ends):
-        raise ValueError(f"{', '.join(ends)}: wanted none of space beside se2 and point2")
     kinds = [VARIABLE_KINDS[end] for end in ends]
     values, scalars = sum(kind.size for kind in kinds), sum(kind.dim for kind in kinds)
     if not (1 <= len(ends) <= MOST_JOINED and 1 <= rows <= scalars + 1):

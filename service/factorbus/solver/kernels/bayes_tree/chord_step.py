@@ -8,10 +8,10 @@ factor, r₀ + J₀ δ, is corrected by what it misses of the residual at the es
 
 with J₀ as it is in R.  So only right-hand sides change:
 
-1  correct      the gradients of the factors whose model misses much
-2  forward      d = R⁻ᵀ η in their cliques and those above, children first
-3  substitute   back down, as in any step
-4  measure      what is left to miss is counted from there
+1  correct        the gradients of the factors whose model misses much
+2  forward_solve  d = R⁻ᵀ η in their cliques and those above, children first
+3  substitute     back down, as in any step
+4  measure        what is left to miss is counted from there
 """
 
 import numpy as np
@@ -22,7 +22,12 @@ from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.back_substitute import QUIET, substitute
 from factorbus.solver.kernels.bayes_tree.eliminate_again import lap
 from factorbus.solver.kernels.bayes_tree.linearization_error import measure
-from factorbus.solver.kernels.bayes_tree.missed_residual import error_quaternion, missed_se2, missed_se3, turn_se2
+from factorbus.solver.kernels.bayes_tree.missed_residual import (
+    error_quaternion,
+    missed_se2,
+    missed_se3,
+    turn_since_linearized,
+)
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
@@ -69,7 +74,7 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
                 end = mark_above(v, node, clique, state, tree.marked, end)
     now = lap(now, tl.LINEARIZE, state)
     # 2
-    roots = forward(graph, tree, tree.marked[end:].copy())
+    roots = forward_solve(graph, tree, tree.marked[end:].copy())
     now = lap(now, tl.ELIMINATE, state)
     # 3
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
@@ -99,7 +104,7 @@ def correct_se2(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     var, fac, row, hessian, p = graph.var, graph.fac, tree.factor_errors[f], tree.hessian, graph.payload
     i, j, r, A, B = fac[f, at.F_I], fac[f, at.F_J], scratch.r, scratch.H[0], scratch.H[1]
     evaluate_apart(f, var, fac, tree.lin[0], p, r, A, B)
-    phi = turn_se2(i, var, tree.scalars[0])
+    phi = turn_since_linearized(i, var, tree.scalars[0])
     x, y, _ = missed_se2(var[i, at.V_AT], var[j, at.V_AT], phi, graph.values, tree.lin[0])
     row[tl.E_MISSED], row[tl.E_MISSED + 1] = x, y
     # In the frame of the residual, to which A takes translations of the first pose, turned about.
@@ -173,7 +178,7 @@ def correct_se3(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
 
 
 @part
-def forward(graph: Graph, tree: Tree, cliques: I64) -> I64:
+def forward_solve(graph: Graph, tree: Tree, cliques: I64) -> I64:
     """d and the right-hand sides of update matrices anew, in `cliques`, children first; gives those that are roots."""
     var, clique, lists, numbers = graph.var, tree.clique, tree.lists, tree.numbers
     state, totals = tree.state, tree.totals

@@ -31,15 +31,19 @@ def missed_error_se2(graph: Graph, tree: Tree, f: int) -> tuple[float, float, fl
     """
     var, fac, values, row = graph.var, graph.fac, graph.values, tree.factor_errors[f]
     i, j = fac[f, at.F_I], fac[f, at.F_J]
-    phi = turn_se2(i, var, tree.scalars[0])
+    phi = turn_since_linearized(i, var, tree.scalars[0])
     bx, by, shift = missed_se2(var[i, at.V_AT], var[j, at.V_AT], phi, values, tree.lin[0])
     if row[tl.E_FORM] >= tl.CORRECTED:
         bx, by = bx - row[tl.E_MISSED], by - row[tl.E_MISSED + 1]
-    return row[tl.E_ROOT] * math.sqrt(bx * bx + by * by), shift, abs(turn_se2(j, var, tree.scalars[0]) - phi)
+    return (
+        row[tl.E_ROOT] * math.sqrt(bx * bx + by * by),
+        shift,
+        abs(turn_since_linearized(j, var, tree.scalars[0]) - phi),
+    )
 
 
 @inline_kernel
-def turn_se2(i: int, var: I64, delta: F64) -> float:
+def turn_since_linearized(i: int, var: I64, delta: F64) -> float:
     """φ of plane pose i; 0 of a fixed one."""
     return load(delta, var[i, at.V_SCALAR] + 2) if var[i, at.V_SCALAR] >= 0 else 0.0
 

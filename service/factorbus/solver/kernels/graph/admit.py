@@ -164,7 +164,7 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
             payload[p + numbers] = scale
             numbers += 1
         if is_many:
-            append_rows(kind, loss, dim, ends, numbers, graph)
+            append_factor_rows(kind, loss, dim, ends, numbers, graph)
         else:
             append_factor(kind, loss, i, j, numbers, graph)
     return -1, gt.GOOD, rest
@@ -231,7 +231,7 @@ def find_many_ends(kinds: I64, raw: bytes, keys: int, graph: Graph, ends: I64) -
 
 
 @part
-def append_rows(kind: int, loss: int, dim: int, ends: I64, numbers: int, graph: Graph) -> None:
+def append_factor_rows(kind: int, loss: int, dim: int, ends: I64, numbers: int, graph: Graph) -> None:
     """One more factor that `many` evaluates: a row, or one for each pair of its variables (`factor_rows`)."""
     fac, counts, count = graph.fac, graph.counts, rows_of_arity(ends.size)
     first = counts[at.FACTORS]

@@ -49,7 +49,7 @@ def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
     """The factor that begins at row f at the values x, whitened and with its loss; what χ² has beside rᵀ r."""
     more, many = evaluate_plain(f, var, fac, x, payload)
     dim, start = len(many.J), information_start(f, var, fac)
-    whiten(dim, start, payload, many)
+    whiten_in_place(dim, start, payload, many)
     loss = loss_code(f, fac)
     if loss != at.NO_LOSS:
         more = soften_many(loss, payload[start + dim * (dim + 1) // 2], more, many)
@@ -74,7 +74,7 @@ def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
 
 
 @part
-def whiten(dim: int, p: int, payload: F64, many: Many) -> None:
+def whiten_in_place(dim: int, p: int, payload: F64, many: Many) -> None:
     """r and J times C, upper triangular, with CᵀC = Ω, whose upper triangle begins at payload[p]."""
     r, J, k, is_diagonal = many.r, many.J, p, True
     for a in range(dim):
