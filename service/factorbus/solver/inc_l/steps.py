@@ -16,7 +16,7 @@ from factorbus.solver.graph import observations
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.incremental import Incremental, Where
 from factorbus.solver.inc_l.strategy import Plan
-from factorbus.solver.kernels.graph.local_init import settle_new
+from factorbus.solver.kernels.graph.local_init import initialize_new
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.modes import mode_named
@@ -83,7 +83,7 @@ class IncrementalSteps:
 
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
-        return self._step(settle, place_new=False)
+        return self._step(settle, initialize_locally=False)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
@@ -112,11 +112,11 @@ class IncrementalSteps:
         """Bytes in use for Λ, η and R."""
         return self._system.memory_bytes()
 
-    def _step(self, settle: bool, place_new: bool) -> StepReport:
+    def _step(self, settle: bool, initialize_locally: bool) -> StepReport:
         watch = Stopwatch(self._options.clock)
         try:
             # 1. What is new goes to a good place; linearized there it is added to Λ and η.
-            if place_new:
+            if initialize_locally:
                 self._place_new()
             added = self._system.blocks.extend(self._graph, self._done.graph)
             watch.lap("linearize")
@@ -143,7 +143,7 @@ class IncrementalSteps:
         few = counts[at.VARIABLES] - mark[at.VARIABLES] <= _FEW and counts[at.FACTORS] - mark[at.FACTORS] <= 8 * _FEW
         if few and self._mode.updates:
             variables, factors = (mark[at.VARIABLES], counts[at.VARIABLES]), (mark[at.FACTORS], counts[at.FACTORS])
-            settle_new(*variables, *factors, self._options.tuning.chi2_epsilon, self._graph.array_table)
+            initialize_new(*variables, *factors, self._options.tuning.chi2_epsilon, self._graph.array_table)
 
     def _suspects(self) -> I64:
         """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold."""

@@ -20,9 +20,7 @@ SAVED = MOST_SCALARS + 2  # numbers that are saved of a variable: its diagonal s
 
 
 @part
-def take_in_variables(
-    v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, turns: F64, state: I64
-) -> None:
+def add_variables(v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, turns: F64, state: I64) -> None:
     """Variables up to v1 get a row each; they are linearized at their first values."""
     for v in range(state[tl.S_VARIABLES], v1):
         node[v, tl.N_CLIQUE] = node[v, tl.N_OWN] = node[v, tl.N_ADJ] = -1
@@ -51,13 +49,13 @@ def note_turn(v: int, var: I64, lin: F64, turns: F64) -> None:
 
 
 @part
-def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
+def add_factors(graph: Graph, tree: Tree, f1: int) -> bool:
     """Factors up to f1 are linearized, and join the incidences of their variables; gives whether all χ² are numbers.
 
     T_ADDED gets their χ² at the estimate.  Their first variables are listed: one may have moved since it was
     linearized, and the factor is then off its model from the start.
 
-    saved (2 per factor, SAVED): what that changes of variables, for `take_out`
+    saved (2 per factor, SAVED): what that changes of variables, for `remove_added`
     """
     var, fac, values = graph.var, graph.fac, graph.values
     node, link, hessian, scalars = tree.node, tree.link, tree.hessian, tree.scalars
@@ -127,7 +125,7 @@ def largest_diagonal_of(v: int, var: I64, scalars: F64) -> float:
 
 
 @part
-def take_out(graph: Graph, tree: Tree, v0: int, f0: int) -> None:
+def remove_added(graph: Graph, tree: Tree, v0: int, f0: int) -> None:
     """Forget the variables from v0 and the factors from f0 on, which came last; the others are as they were."""
     var, fac = graph.var, graph.fac
     node, link, scalars, turns, saved = tree.node, tree.link, tree.scalars, tree.turns, tree.saved

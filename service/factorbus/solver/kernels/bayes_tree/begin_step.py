@@ -5,7 +5,7 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.graph.initialize import follow, reach
-from factorbus.solver.kernels.graph.local_init import settle_new
+from factorbus.solver.kernels.graph.local_init import initialize_new
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.records import table_of
 from factorbus.solver.kernels.model import layout as at
@@ -33,7 +33,7 @@ def begin_step(graph: Graph, tree: Tree) -> int:
     ):
         return tl.NO_ROOM
     if v1 - v0 <= settings[tl.P_INITIALIZE]:
-        settle_new(v0, v1, f0, f1, settings[tl.P_CHI2_EPSILON], table_of(graph))
+        initialize_new(v0, v1, f0, f1, settings[tl.P_CHI2_EPSILON], table_of(graph))
     if state[tl.S_CHECKED] == 0 and v1 > v0:
         determined = np.empty(v1 - v0, np.int64)
         for v in range(v0, v1):

@@ -17,7 +17,7 @@ A step with nothing new goes on from 2 with what waits, and substitutes back thr
 """
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.add_to_tree import take_in_factors, take_in_variables, take_out
+from factorbus.solver.kernels.bayes_tree.add_to_tree import add_factors, add_variables, remove_added
 from factorbus.solver.kernels.bayes_tree.begin_step import begin_step
 from factorbus.solver.kernels.bayes_tree.changed_variables import count_differing
 from factorbus.solver.kernels.bayes_tree.chord_step import chord_step
@@ -70,8 +70,8 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     if state[tl.S_CONTINUES] != 0 and not goes_on_with_it:
         mark_unconverged(graph, tree, scaled)
     v0 = state[tl.S_FIRST_NEW]
-    take_in_variables(v1, graph.var, graph.values, tree.node, tree.lin, tree.scalars, tree.turns, state)
-    if not take_in_factors(graph, tree, f1):
+    add_variables(v1, graph.var, graph.values, tree.node, tree.lin, tree.scalars, tree.turns, state)
+    if not add_factors(graph, tree, f1):
         undo(graph, tree, v0)
         return tl.INFINITE
     while True:
@@ -146,7 +146,7 @@ def undo(graph: Graph, tree: Tree, v0: int) -> None:
         node[moved[k], tl.N_LISTED] = 0
     state[tl.S_MOVED], totals[tl.T_ADDED] = 0, 0.0
     totals[tl.T_LARGEST_DIAGONAL] = totals[tl.T_LARGEST_DIAGONAL_BEFORE]
-    take_out(graph, tree, v0, state[tl.S_TAKEN])
+    remove_added(graph, tree, v0, state[tl.S_TAKEN])
     state[tl.S_STEP] -= 1
     state[tl.S_CHANGED] = state[tl.S_CHANGED_BEFORE]
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0

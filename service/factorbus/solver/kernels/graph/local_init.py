@@ -31,7 +31,7 @@ class _Linear(NamedTuple):
 
 
 @kernel("void(int64, int64, int64, int64, float64, int64[::1])")
-def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, graph_table: I64) -> None:
+def initialize_new(v0: int, v1: int, f0: int, f1: int, least: float, graph_table: I64) -> None:
     """Gauss-Newton on one free variable of v0 .. v1−1 after the other, with those of factors f0 .. f1−1 that are on it.
 
     Goes on while a step lowers the χ² of those factors, and by more than `least` and a thousandth of it.  graph_table:
@@ -40,11 +40,11 @@ def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, graph_table: I6
     graph = graph_at(graph_table)
     for v in range(v0, v1):
         if graph.var[v, at.V_COLUMN] >= 0 and is_seen_twice(v, f0, f1, graph.fac):
-            settle(v, f0, f1, least, graph)
+            initialize_variable(v, f0, f1, least, graph)
 
 
 @part
-def settle(v: int, f0: int, f1: int, least: float, graph: Graph) -> None:
+def initialize_variable(v: int, f0: int, f1: int, least: float, graph: Graph) -> None:
     """The same for one variable."""
     var, values = graph.var, graph.values
     M, z, step, before = np.empty((_MOST, _MOST)), np.empty(_MOST), np.empty(_MOST), np.empty(_MOST)
