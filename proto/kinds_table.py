@@ -1,16 +1,21 @@
-"""Write the table of factors in README.md from `factorbus.proto.kinds`.
+"""Write the tables of factors, and of the operations of own kinds, in README.md from the code.
 
 python proto/kinds_table.py        a test compares
 """
 
 from pathlib import Path
 
+from factorbus.proto.expressions.operations import OPERATIONS, Operation
 from factorbus.proto.kinds import FACTOR_KINDS, LINEAR_NAME, VARIABLE_KINDS, FactorKind
 
 README = Path(__file__).with_name("README.md")
 _HEAD = """\
 | factor | connects | measured z | residual r (its order is the order of the information matrix) |
 |---|---|---|---|
+"""
+_OPERATIONS_HEAD = """\
+| operation | gives |
+|---|---|
 """
 _LINEAR = (
     f"| `{LINEAR_NAME}` | any x₁, x₂, … | y of each variable, H of each (rows x its scalars, row by row), b (rows) "
@@ -21,7 +26,8 @@ _LINEAR = (
 def main() -> None:
     """Replace the table that is there."""
     text = README.read_text()
-    README.write_text(text.replace(found(text), table()))
+    text = text.replace(found(text), table())
+    README.write_text(text.replace(found(text, _OPERATIONS_HEAD), operations()))
 
 
 def table() -> str:
@@ -32,9 +38,21 @@ def table() -> str:
     return _HEAD + "".join(rows) + _LINEAR
 
 
-def found(text: str) -> str:
-    """The table in the text of the page: up to the next line that is no row."""
-    start = text.index(_HEAD)
+def operations() -> str:
+    """A row for each operation, and for numbers."""
+    rows = [f"| `{each.name}({_arguments(each)})` | {each.means} |\n" for each in OPERATIONS.values()]
+    return _OPERATIONS_HEAD + "".join(rows)
+
+
+def _arguments(operation: Operation) -> str:
+    if operation.arguments < 0:
+        return "a,b,..."
+    return ",".join([*"abc"[: operation.arguments], *(("first", "count") if operation.numbers else ())])
+
+
+def found(text: str, head: str = _HEAD) -> str:
+    """The table with this head in the text of the page: up to the next line that is no row."""
+    start = text.index(head)
     return text[start : text.index("\n\n", start) + 1]
 
 

@@ -68,6 +68,7 @@ def vectors() -> dict[str, bytes]:
         "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
         "insert_mounts": codec.encode_insert(Insert(10, _mounts(), epoch=7)),
         "insert_linear_kinds": codec.encode_insert(Insert(9, _linear_kinds(), epoch=7)),
+        "insert_own_kind": codec.encode_insert(Insert(11, _own_kind(), epoch=7)),
         "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, convert_below=0.1)),
         "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
         "insert_marginalize": codec.encode_insert(
@@ -198,6 +199,13 @@ def _linear_kinds() -> Batch:
             here += VARIABLE_KINDS[end].size
         groups.append(Factors(kind.name, keys, numbers[None], np.eye(rows)[np.triu_indices(rows)][None]))
     return Batch(tuple(_vectors()), tuple(groups))
+
+
+def _own_kind() -> Batch:
+    """A kind that a client has written itself: its name is its formula."""
+    kind = "near(a:se3,l:point3,bias:vector1,z:1)=subtract(add(norm(act(inverse(a),l)),bias),z)"
+    keys = np.array([[symbol("y", 1), symbol("p", 1), symbol("v", 1)]])
+    return Batch(factors=(Factors(kind, keys, np.array([[2.5]]), np.array([[4.0]])),))
 
 
 def _vectors() -> Iterator[Variables]:

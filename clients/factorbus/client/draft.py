@@ -26,7 +26,7 @@ from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_num
 from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.client.linear import linear_factor
 from factorbus.proto.camera import Camera
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind, FactorKinds
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import BadShape, UnknownKind
 from factorbus.proto.stamps import NO_STAMP
@@ -308,15 +308,15 @@ class Draft:
 
     def factor(
         self,
-        kind: str,
+        kind: str | FactorKind,
         keys: Sequence[Key],
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
     ) -> Draft:
-        """A factor of any kind of `factorbus.proto.kinds`."""
-        of = _known(FACTOR_KINDS, kind)
-        numbers = key_numbers(keys).tolist()
-        where = " ".join([kind, *map(format_symbol, numbers)])
+        """A factor of any kind of `factorbus.proto.kinds`, or of one of your own (`factorbus.client.expressions`)."""
+        of = kind if isinstance(kind, FactorKind) else _known(FACTOR_KINDS, kind)
+        kind, numbers = of.name, key_numbers(keys).tolist()
+        where = " ".join([of.called, *map(format_symbol, numbers)])
         if len(numbers) != len(of.connects):
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
         row = _row(f"{where}: measured", measured, of.size)
@@ -388,7 +388,8 @@ def _lens(camera: Camera) -> list[float]:
 
 def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
     if not isinstance(kind, str) or kind not in kinds:
-        raise UnknownKind("draft", str(kind), tuple(kinds))
+        known = kinds.names(str(kind)) if isinstance(kinds, FactorKinds) else tuple(kinds)
+        raise UnknownKind("draft", str(kind), known)
     return kinds[kind]
 
 

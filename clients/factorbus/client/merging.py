@@ -36,7 +36,6 @@ from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
 
 ABSOLUTE = ("refuse", "leave_out", "keep")
 _PRIORS = ("prior_se2", "prior_se3")
-_OF_THE_WORLD = tuple(name for name, kind in FACTOR_KINDS.items() if kind.is_absolute)
 _BETWEEN = ("between_se2", "between_se3")
 _SHOWN = 5
 
@@ -229,7 +228,7 @@ def _relative(batch: Batch, absolute: str, mounts: I64) -> tuple[Batch, dict[str
 
 
 def _stays(group: Factors) -> np.ndarray:
-    return np.full(len(group.keys), group.kind not in _OF_THE_WORLD)
+    return np.full(len(group.keys), not FACTOR_KINDS[group.kind].is_absolute)
 
 
 def _is_gauge(batch: Batch, held: Mapping[str, int]) -> bool:

@@ -8,6 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.expressions.declaration import Declaration
+from factorbus.proto.expressions.evaluate import evaluate
+from factorbus.proto.expressions.operations import value_size
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import parts_of
 from factorbus.proto.messages import Factors, Variables
@@ -18,7 +21,10 @@ _WIDEST = 7  # numbers of a pose in space
 def chi2_of_factors(group: Factors, values: "Values") -> F64:
     """rᵀ Ω r of each factor of `group` (m,); NaN where a variable has no value or the kind is not one of ours."""
     known = FACTOR_KINDS.get(group.kind)
-    residual = _linear(group.kind) if known is not None and known.is_linear else _RESIDUALS.get(group.kind)
+    if known is not None and known.own is not None:
+        residual = _of_own(known.own)
+    else:
+        residual = _linear(group.kind) if known is not None and known.is_linear else _RESIDUALS.get(group.kind)
     if residual is None or not len(group.keys):
         return np.full(len(group.keys), np.nan)
     r = residual(*(values.rows(column) for column in group.keys.T), group.measured)
@@ -166,6 +172,18 @@ def _at_mount(kind: str) -> Callable[..., F64]:
 
     def residual(first: F64, second: F64, mount: F64, z: F64) -> F64:
         return of(sensor(first, mount), sensor(second, mount) if connects[1] == connects[0] else second, z)
+
+    return residual
+
+
+def _of_own(declared: Declaration) -> Callable[..., F64]:
+    """The residual of a kind that a client has written itself, factor by factor."""
+    sizes = [value_size(kind) for kind in declared.types[: len(declared.variables)]]
+
+    def residual(*ends: F64) -> F64:
+        rows = zip(*ends, strict=True)
+        found = [evaluate(declared, [x[:n] for x, n in zip(row, sizes, strict=False)], row[-1]) for row in rows]
+        return np.array(found).reshape(-1, declared.residual_size)
 
     return residual
 

@@ -1,4 +1,4 @@
-"""The kinds of variables and factors as the wire knows them: names, sizes and what connects to what.
+"""The kinds of factors as the wire knows them: names, sizes and what connects to what.
 
 The mathematics of each kind (residual, Jacobians, ⊞) is the solver's; this table is all a client needs to
 build and read messages, and a test holds the two against each other.  A name never changes its meaning.
@@ -9,23 +9,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+from factorbus.proto.expressions.declaration import BadExpression, Declaration
+from factorbus.proto.expressions.formula import MOST_CHARACTERS, read_formula, write_formula
+from factorbus.proto.expressions.frames import moving_ends
+from factorbus.proto.expressions.operations import name_of, value_size, zero_of
+from factorbus.proto.variable_kinds import POSE2, POSE3, VARIABLE_KINDS
 from factorbus.wording import counted
-
-
-@dataclass(frozen=True, slots=True)
-class VariableKind:
-    """One kind of variable: `size` numbers are stored and sent, `dim` is the size of its tangent space."""
-
-    name: str
-    size: int
-    dim: int
-    values: str
-    is_pose: bool = False
-
-    @property
-    def is_vector(self) -> bool:
-        """Whether it is plain numbers, which no frame moves."""
-        return self.name.startswith("vector")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +26,7 @@ class FactorKind:
     example: a measurement, for the golden message of the kind
     half_angles: the last three rows of the residual are the vector part of a quaternion
     base: the kind that this is with the pose of a sensor, whose mount on the robot is the last variable
+    own: of a kind that a client has written itself, what it is; its name is the formula
     """
 
     name: str
@@ -48,6 +38,7 @@ class FactorKind:
     example: tuple[float, ...]
     half_angles: bool = False
     base: str = ""
+    own: Declaration | None = None
 
     def __post_init__(self) -> None:
         if len(self.example) != self.size:
@@ -64,7 +55,7 @@ class FactorKind:
     @property
     def is_absolute(self) -> bool:
         """Whether it is known in the map's frame, and not of variables relative to each other."""
-        return len(self.connects) == 1
+        return moving_ends(self.own) is None if self.own else len(self.connects) == 1
 
     @property
     def is_linear(self) -> bool:
@@ -72,32 +63,34 @@ class FactorKind:
         return self.name.startswith(_LINEAR)
 
     @property
+    def called(self) -> str:
+        """Its name, for people: of one's own kind what stands before its variables."""
+        return self.own.name if self.own else self.name
+
+    @property
+    def on_robot(self) -> tuple[int, ...]:
+        """Which of its variables are poses or points on a robot, which do not move with the map's frame."""
+        if self.own is None:
+            return (len(self.connects) - 1,) if self.base else ()
+        moving = moving_ends(self.own)
+        if moving is None:
+            return ()
+        return tuple(n for n, end in enumerate(self.connects) if n not in moving and not end.startswith("vector"))
+
+    @property
     def sees_landmark(self) -> bool:
         """Whether it connects a pose with what is no pose."""
-        return not self.is_linear and [VARIABLE_KINDS[end].is_pose for end in self.connects] == [True, False]
+        if self.is_linear or self.own:
+            return False
+        return [VARIABLE_KINDS[end].is_pose for end in self.connects] == [True, False]
 
 
-_POSE2 = "x y (metres), theta (radians)"
-_POSE3 = "x y z (metres), unit quaternion qx qy qz qw"
 _PIXEL = "u v (pixels)"
 _RADTAN = (1.0, 400.0, 401.0, 320.0, 240.0, 0.0, -0.25, 0.125, 0.001, -0.002, 0.0)
 _LENS = "lens (11 numbers: `factorbus.proto.camera.Camera.lens`)"
 
 # What a factor that is far off may count instead of r'Wr, by the name of the loss; its scale is in standard deviations.
 LOSSES = ("huber", "cauchy", "geman-mcclure", "tukey", "dcs")
-
-VARIABLE_KINDS = {
-    kind.name: kind
-    for kind in (
-        VariableKind("se2", 3, 3, _POSE2, is_pose=True),
-        VariableKind("se3", 7, 6, _POSE3, is_pose=True),
-        VariableKind("point2", 2, 2, "x y (metres)"),
-        VariableKind("point3", 3, 3, "x y z (metres)"),
-        VariableKind("idp", 6, 6, "x y z of the first camera (metres), theta, phi (radians), rho (1/metre)"),
-        *(VariableKind(f"vector{n}", n, n, f"{counted(n, 'number')}, of any units") for n in range(1, 10)),
-    )
-}
-
 
 # The most variables of a linear factor; it has as many rows as they have scalars, and one more, at most.
 MOST_JOINED = 128
@@ -146,28 +139,65 @@ def _read_linear(name: str) -> FactorKind:
     return linear_kind(int(found[1]), tuple(found[2][1:].split("_")))
 
 
+def own_kind(declared: Declaration) -> FactorKind:
+    """The kind that a declaration is.  Raises BadExpression: its name is one of the others'."""
+    if declared.name in FACTOR_KINDS or declared.name.startswith(_LINEAR):
+        raise BadExpression(f"{declared.name} is a kind that there is already; wanted another name")
+    ends, name = tuple(kind for _, kind in declared.variables), write_formula(declared)
+    measured, size = name_of(declared.measured), value_size(declared.measured)
+    return FactorKind(
+        name, ends, size, declared.residual_size, measured, name, zero_of(declared.measured), own=declared
+    )
+
+
+@lru_cache(maxsize=256)
+def _own_of_name(name: str) -> FactorKind | None:
+    """The own kind that a formula is; None: it is none."""
+    try:
+        return own_kind(read_formula(name))
+    except BadExpression:
+        return None
+
+
+def _found_by_name(name: str) -> FactorKind | None:
+    """Of the families of kinds, of which there are more than can be listed."""
+    if _is_formula(name):
+        return _own_of_name(name) if len(name) <= MOST_CHARACTERS else None
+    return _linear_of_name(name)
+
+
+def _is_formula(name: str) -> bool:
+    """Whether a kind is meant that a client has written itself: its name has at most 63 characters before "("."""
+    return "(" in name[:64]
+
+
 class FactorKinds(dict[str, FactorKind]):
-    """The kinds by name.  Those of linear factors, of which there is one for any rows and variables, are found by name
-    as well, and are not among the entries."""
+    """The kinds by name.  Those of linear factors, of which there is one for any rows and variables, and those of one's
+    own, whose name is their formula, are found by name as well, and are not among the entries."""
 
     def __missing__(self, name: str) -> FactorKind:
-        if (kind := _linear_of_name(name)) is None:
+        if (kind := _found_by_name(name)) is None:
             raise KeyError(name)
         return kind
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or (isinstance(name, str) and _linear_of_name(name) is not None)
+        return super().__contains__(name) or (isinstance(name, str) and _found_by_name(name) is not None)
 
     def get(self, name: str, default: Any = None) -> Any:
         """The kind of that name, or `default`."""
         found = super().get(name)
-        return found or _linear_of_name(name) or default
+        return found or _found_by_name(name) or default
 
     def names(self, unknown: str = "") -> tuple[str, ...]:
-        """For a person: all names, and the form of those of linear factors.
+        """For a person: all names, and the form of those of families.
 
         Of an `unknown` one that begins as these do, what is wrong with it.
         """
+        if _is_formula(unknown):
+            try:
+                own_kind(read_formula(unknown))
+            except BadExpression as why:
+                return (f"a formula ({why})",)
         if unknown.startswith(_LINEAR):
             if len(unknown) > _LONGEST:
                 return (f"{LINEAR_NAME}, of up to {MOST_JOINED} variables",)
@@ -175,7 +205,7 @@ class FactorKinds(dict[str, FactorKind]):
                 _read_linear(unknown)
             except ValueError as why:
                 return (f"{LINEAR_NAME} ({why})",)
-        return (*self, LINEAR_NAME)
+        return (*self, LINEAR_NAME, "or a formula")
 
 
 _WITH_MOUNT = (
@@ -194,13 +224,13 @@ def _with_mount(kind: FactorKind) -> FactorKind:
 FACTOR_KINDS = FactorKinds(
     (kind.name, kind)
     for kind in (
-        FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
+        FactorKind("prior_se2", ("se2",), 3, 3, POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
         FactorKind(
             "prior_se3",
             ("se3",),
             7,
             6,
-            _POSE3 + ", in the map",
+            POSE3 + ", in the map",
             "z⁻¹ ∘ x as (x, y, z, qx, qy, qz), sign with qw ≥ 0",
             (1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8),
             half_angles=True,
@@ -212,7 +242,7 @@ FACTOR_KINDS = FactorKinds(
             ("se2", "se2"),
             3,
             3,
-            _POSE2 + ": the second pose in the first one's frame",
+            POSE2 + ": the second pose in the first one's frame",
             "z⁻¹ ∘ (a⁻¹ ∘ b) as (x, y, wrap θ)",
             (1.0, 0.0, 0.25),
         ),
@@ -221,7 +251,7 @@ FACTOR_KINDS = FactorKinds(
             ("se3", "se3"),
             7,
             6,
-            _POSE3 + ": the second pose in the first one's frame",
+            POSE3 + ": the second pose in the first one's frame",
             "z⁻¹ ∘ (a⁻¹ ∘ b) as (x, y, z, qx, qy, qz), qw ≥ 0",
             (1.0, 0.0, 0.5, 0.0, 0.0, 0.6, 0.8),
             half_angles=True,

@@ -8,9 +8,9 @@ from factorbus.proto.messages import Batch, Factors, Variables
 
 
 def mounts_of(batch: Batch) -> I64:
-    """The keys of the mounts: the last variables of the factors whose kind has a mount."""
+    """The keys of the mounts: of the variables of factors that are on a robot, as their kind says."""
     known = [(FACTOR_KINDS.get(group.kind), group.keys) for group in batch.factors]
-    found = [keys[:, -1] for kind, keys in known if kind is not None and kind.base]
+    found = [keys[:, n] for kind, keys in known if kind is not None for n in kind.on_robot]
     return np.unique(np.concatenate([np.empty(0, np.int64), *found]))
 
 

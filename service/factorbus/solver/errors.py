@@ -6,6 +6,7 @@
     ├── TooLarge               too_large               more than is searched through in one piece
     ├── NoBackend              no_backend              a backend whose package is not installed
     ├── UnknownKind            unknown_kind            a kind of variable or factor that does not exist
+    ├── KindTaken              kind_taken              an own kind with the name of another that the map has
     ├── BadShape               bad_shape               arrays whose sizes or types do not fit their kind or each other
     ├── DuplicateVariable      duplicate_variable      a key that is taken already
     ├── UnknownVariable        unknown_variable        a factor on a key that no variable has
@@ -103,12 +104,31 @@ class NoBackend(SolverError):
         )
 
 
+_MOST_SHOWN = 200  # characters of a formula
+
+
+def _cut(formula: str) -> str:
+    return formula if len(formula) <= _MOST_SHOWN else f"{formula[:_MOST_SHOWN]}…"
+
+
 class UnknownKind(SolverError):
     code = "unknown_kind"
 
     def __init__(self, what: str, seen: str, known: Sequence[str]) -> None:
         wanted = f"one of {', '.join(known)}"
         super().__init__(f"there is no kind of {what} {seen!r}; wanted {wanted}", seen=seen, wanted=wanted)
+
+
+class KindTaken(SolverError):
+    code = "kind_taken"
+
+    def __init__(self, name: str, here: str, given: str) -> None:
+        super().__init__(
+            f"{name} is {_cut(here)} in this map, and is {_cut(given)} now; wanted another name for another kind",
+            kind=name,
+            here=here,
+            given=given,
+        )
 
 
 class BadShape(SolverError):

@@ -66,11 +66,11 @@ def arities_of(fac: I64) -> I64:
 
 
 def are_of_many(fac: I64) -> np.ndarray:
-    """Which rows (n,) are of factors that `many` evaluates: of more than two variables, or linear ones."""
+    """Which rows (n,) are of factors that `many` evaluates: of more than two, linear, or own."""
     return fac[:, at.F_FLAGS] >> at.OFFSET_SHIFT != 0
 
 
 def mount_variables(fac: I64) -> I64:
-    """The variables that are mounts of sensors: the last of each factor of three that is no linear one."""
+    """The variables that are mounts of sensors: the last of each factor of three of a kind with a mount."""
     of_three = fac[:, at.F_FLAGS] >> at.ENDS_SHIFT & at.ENDS_MASK == 3
-    return np.unique(fac[np.flatnonzero(of_three & (fac[:, at.F_KIND] != at.LINEAR)) + 1, at.F_J])
+    return np.unique(fac[np.flatnonzero(of_three & (fac[:, at.F_KIND] < at.LINEAR)) + 1, at.F_J])

@@ -11,6 +11,7 @@ from factorbus.solver.kernels.graph.check_rows import (
     check_information,
     check_linear,
     check_measurement,
+    check_own_measurement,
     check_value,
 )
 from factorbus.solver.kernels.graph.initialize import reach
@@ -83,6 +84,7 @@ def check_room(groups: I64, graph: Graph) -> int:
             variables, numbers = variables + count, numbers + count * size_of(kind)
         else:
             arity, dim, size = shape_of(groups[g])
+            size += groups[g, gt.G_LENGTH]
             factors += count * rows_of_arity(arity)
             measured += count * (size + dim * (dim + 1) // 2 + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0))
             if is_camera(kind) and groups[g, gt.G_LIMITED] == 0:
@@ -124,7 +126,7 @@ def append_variables(raw: bytes, group: I64, graph: Graph) -> tuple:
 def shape_of(group: I64) -> tuple:
     """(variables, numbers of a residual, numbers measured) of each factor of a group."""
     kind = group[gt.G_KIND]
-    if kind == at.LINEAR:
+    if kind == at.LINEAR or kind == at.OWN:
         return group[gt.G_ARITY], group[gt.G_ROWS], group[gt.G_SIZE]
     return arity_of(kind), residual_dim(kind), information_at(kind)
 
@@ -136,10 +138,11 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
     kind, loss, payload, counts = group[gt.G_KIND], group[gt.G_LOSS], graph.payload, graph.counts
     arity, dim, size = shape_of(group)
     triangle, ends, kinds = dim * (dim + 1) // 2, np.empty(arity, np.int64), np.empty(arity, np.int64)
+    has_ends = group[gt.G_ENDS] != gt.NOWHERE
     for n in range(arity):
-        kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if kind == at.LINEAR else kind_of_end(kind, n)
-    is_many, scratch = kind == at.LINEAR or arity > 2, np.empty((dim, dim))
-    rest = gt.OBSERVED if is_camera(kind) else 0
+        kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if has_ends else kind_of_end(kind, n)
+    is_many, scratch = has_ends or arity > 2, np.empty((dim, dim))
+    rest, before = (gt.OBSERVED if is_camera(kind) else 0) | (gt.OWN if kind == at.OWN else 0), group[gt.G_LENGTH]
     for n in range(group[gt.G_COUNT]):
         p, first = counts[at.PAYLOAD], group[gt.G_KEYS] + 8 * n * arity
         i = j = -1
@@ -149,14 +152,20 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
             i, j, fault = find_ends(kind, int_at(raw, first), int_at(raw, first + 8 * (arity - 1)), graph)
         if fault != gt.GOOD:
             return n, fault, rest
-        copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p)
-        copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
-        fault = check_linear(kinds, p, size, payload) if kind == at.LINEAR else check_measurement(kind, p, payload)
+        copy_numbers(raw, group[gt.G_INSTRUCTIONS], before, payload, p)
+        copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p + before)
+        copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + before + size)
+        if kind == at.LINEAR:
+            fault = check_linear(kinds, p, size, payload)
+        elif kind == at.OWN:
+            fault = check_own_measurement(p, payload)
+        else:
+            fault = check_measurement(kind, p, payload)
         if fault == gt.GOOD:
-            fault = check_information(dim, p + size, payload, scratch)
+            fault = check_information(dim, p + before + size, payload, scratch)
         if fault != gt.GOOD:
             return n, fault, rest
-        numbers = size + triangle
+        numbers = before + size + triangle
         if loss != at.NO_LOSS:
             scale = float_at(raw, group[gt.G_SCALE] + 8 * n)
             if not (scale >= LEAST_SCALE and scale <= MOST_NUMBER):

@@ -5,12 +5,13 @@ of that pair in Λ.  So whatever follows from which variables are joined, such a
 factor changes, is the same for all factors.  The first row has the kind, the measurement and the loss, and the first
 n − 1 rows name the variables.
 
-Such factors, and linear ones of one or two variables, are evaluated by `many`; their first row says how many variables
-and numbers of a residual they have.
+Such factors, linear ones, and those of clients' own kinds are evaluated by `many`; their first row says how many
+variables and numbers of a residual they have.
 """
 
-from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.expression_layout import X_BEFORE
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim, size_of
 
 
@@ -22,7 +23,7 @@ def loss_code(f: int, fac: I64) -> int:
 
 @inline_kernel
 def is_one_of_many(f: int, fac: I64) -> bool:
-    """Whether row f is of a factor that `many` evaluates: of more than two variables, or a linear one."""
+    """Whether row f is of a factor that `many` evaluates: of more than two variables, linear, or own."""
     return fac[f, at.F_FLAGS] >> at.OFFSET_SHIFT != 0
 
 
@@ -61,9 +62,11 @@ def residual_size(f: int, fac: I64) -> int:
 
 
 @part
-def information_start(f: int, var: I64, fac: I64) -> int:
+def information_start(f: int, var: I64, fac: I64, payload: F64) -> int:
     """Where in the payload the information begins of the factor that begins at row f, behind its measurement."""
     start, kind = fac[f, at.F_AT], fac[f, at.F_KIND]
+    if kind == at.OWN:
+        return start + int(payload[start + X_BEFORE])
     if kind != at.LINEAR:
         return start + information_at(kind)
     values = scalars = 0

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
-from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part, shared_kernel, types
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import observation
 from factorbus.solver.kernels.model.dispatch import check_same, dispatcher
@@ -142,12 +142,13 @@ def check_kinds() -> None:
 
 
 check_kinds()
-# The last two are in place of a kind's for linear factors, which `many` evaluates, and for members of a factor of more
-# than two variables, which are not looked at alone.
+# The last are in place of a kind's for linear factors, which `many` evaluates, for members of a factor of more than two
+# variables, which are not looked at alone, and for clients' own kinds, which `many` evaluates.
 _MODELS = (
     *(FACTOR_MODELS[name] for name in FACTOR_KINDS),
     FactorModel(prior_point2, "MATH (3.26)"),
     FactorModel(prior_point2, "", bounded=True),
+    FactorModel(prior_point2, "MATH §3.11"),
 )
 
 
@@ -173,7 +174,7 @@ BOUNDED = np.array([model.bounded for model in _MODELS])
 # By the code of a kind of variables.
 POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])
 VECTOR = np.array([kind.is_vector for kind in VARIABLE_KINDS.values()])
-SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False, False])
+SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False, False, False])
 _BASE = _table(at.FACTOR_CODES[model.base] if model.base else -1 for model in _MODELS)
 
 
@@ -244,5 +245,12 @@ def _other_residual(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F6
     return _other_residual_of(kind, x, ends, p, k, r, A, B)
 
 
-# The residual function of a kind: residual_of(kind, x, ends, p, k, r, A, B); gives what χ² has beside rᵀ Ω r.
-residual_of = part(dispatcher("residual_of", _common, _other_residual))
+_residual_of = inline_kernel(dispatcher("residual_of", _common, _other_residual))
+_FLOATS, _ROWS = types.float64[::1], types.float64[:, ::1]
+_ENDS = types.NamedUniTuple(types.int64, 2, Ends)
+
+
+@shared_kernel(types.int64, _FLOATS, _ENDS, _FLOATS, types.int64, _FLOATS, _ROWS, _ROWS)
+def residual_of(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F64, B: F64) -> float:
+    """The residual function of a kind; gives what χ² has beside rᵀ Ω r."""
+    return _residual_of(kind, x, ends, p, k, r, A, B)

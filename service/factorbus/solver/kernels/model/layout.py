@@ -59,6 +59,8 @@ IDP = VARIABLE_CODES["idp"]
 LINEAR = len(FACTOR_KINDS)
 # In place of a kind: the row is of a pair of a factor that begins before it.
 MEMBER = LINEAR + 1
+# The kind of all factors of kinds that clients wrote themselves (`expression_layout`).
+OWN = MEMBER + 1
 
 PRIOR_SE2 = FACTOR_CODES["prior_se2"]
 PRIOR_SE3 = FACTOR_CODES["prior_se3"]

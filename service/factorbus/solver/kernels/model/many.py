@@ -1,9 +1,10 @@
 """Factors of any number of variables: residual, Jacobians and loss.  MATH §3.6, §3.8.
 
 Their Jacobians stand side by side in J, in the order of the variables, each as wide as its variable has scalars; r and
-J are times C with CᵀC = Ω, so that Ω is one from here on.  One kind is the linear model (3.26), of any variables.  The
-others are kinds of a sensor whose mount m on the robot is estimated: the residual of another kind with the sensor's
-pose c = a ∘ m in place of the robot's pose a.  With A = ∂r/∂c, and Ad(m⁻¹) what a displacement of a is of c,
+J are times C with CᵀC = Ω, so that Ω is one from here on.  One kind is the linear model (3.26), of any variables, and
+one stands for all kinds that clients wrote themselves (`expressions`).  The others are kinds of a sensor whose mount m
+on the robot is estimated: the residual of another kind with the sensor's pose c = a ∘ m in place of the robot's pose a.
+With A = ∂r/∂c, and Ad(m⁻¹) what a displacement of a is of c,
 
     ∂r/∂a = A Ad(m⁻¹),   ∂r/∂m = A,   Ad(m⁻¹) = [ R_mᵀ | −R_mᵀ ⌊t_m⌋ ; 0 | R_mᵀ ]                        (3.35)
 
@@ -15,8 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part, shared_kernel, types
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.expressions import evaluate_own
 from factorbus.solver.kernels.model.factor_rows import (
     count_ends,
     end_of,
@@ -32,6 +34,7 @@ from factorbus.solver.kernels.model.se2 import compose_se2
 from factorbus.solver.kernels.model.se3 import compose_se3, rotation_matrix
 from factorbus.solver.kernels.model.sizes import dim_of, kind_of_end, residual_dim
 
+_FLOATS, _ROWS = types.float64[::1], types.int64[:, ::1]
 POSE = 7  # numbers of a pose, at most
 FIRST, SECOND, MOUNT = range(3)  # the variables of what a sensor measures
 
@@ -44,11 +47,11 @@ class Many(NamedTuple):
     start: I64
 
 
-@part
+@shared_kernel(types.int64, _ROWS, _ROWS, _FLOATS, _FLOATS)
 def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
     """The factor that begins at row f at the values x, whitened and with its loss; what χ² has beside rᵀ r."""
     more, many = evaluate_plain(f, var, fac, x, payload)
-    dim, start = len(many.J), information_start(f, var, fac)
+    dim, start = len(many.J), information_start(f, var, fac, payload)
     whiten_in_place(dim, start, payload, many)
     loss = loss_code(f, fac)
     if loss != at.NO_LOSS:
@@ -68,6 +71,8 @@ def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
     many = Many(np.zeros(max(dim, at.R_SIZE)), np.zeros((dim, start[ends])), start)
     if kind == at.LINEAR:
         linear(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
+    elif kind == at.OWN:
+        more = evaluate_own(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
     else:
         more = at_mount(kind, x, places, payload, fac[f, at.F_AT], many)
     return more, many
