@@ -5,6 +5,7 @@ python proto/kinds_table.py        a test compares
 
 from pathlib import Path
 
+from factorbus.proto.derived_kinds import LETTERS
 from factorbus.proto.kinds import FACTOR_KINDS, LINEAR_NAME, VARIABLE_KINDS, FactorKind
 
 README = Path(__file__).with_name("README.md")
@@ -39,9 +40,13 @@ def found(text: str) -> str:
 
 
 def _ends(kind: FactorKind) -> str:
-    poses = [VARIABLE_KINDS[end].is_pose for end in kind.connects]
     if kind.base:
-        letters = ["a", "b" if all(poses) else "l", "m"]
+        base = FACTOR_KINDS[kind.base]
+        further = zip(kind.connects[len(base.connects) :], kind.modifiers, strict=True)
+        return ", ".join([_ends(base), *(f"{end} {LETTERS[modifier]}" for end, modifier in further)])
+    poses = [VARIABLE_KINDS[end].is_pose for end in kind.connects]
+    if kind.roles:
+        letters = ["f", "v"]
     elif len(poses) == 1:
         letters = ["x"]
     elif all(poses):

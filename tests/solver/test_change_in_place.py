@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from naive.dense_least_squares import DenseGraph
 from naive.estimates import apart, values
+from naive.random_derived import calibration_steps
 from naive.random_graphs import camera_steps, random_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
@@ -33,6 +34,7 @@ WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "others": lambda seed: other_steps(seed),
     "mounts": lambda seed: mount_steps(seed),
     "robust mounts": lambda seed: mount_steps(seed, loss="dcs"),
+    "calibration": lambda seed: calibration_steps(seed, 6),
 }
 
 

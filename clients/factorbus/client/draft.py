@@ -6,34 +6,41 @@ Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.0
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias, TypedDict, TypeVar, Unpack, cast
+from typing import TypedDict, TypeVar, Unpack
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import all_finite, as_numbers, checked_flag, checked_keywords, of_type
 from factorbus.client.certainty import (
     Certainty,
     FeatureCertainty,
-    SensorCertainty,
-    check_names,
     feature_sigmas,
     loss_of,
-    transform_certainty,
     triangle_of,
 )
+from factorbus.client.draft_columns import DraftColumns, Row
+from factorbus.client.further import (
+    AntennaCertainty,
+    GnssCertainty,
+    Measured,
+    OdometryCertainty,
+    RangeCertainty,
+    SensorCertainty,
+    odometry,
+    positioned,
+    sensed,
+    with_information,
+)
+from factorbus.client.geodetic import enu
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
-from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.client.linear import linear_factor
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
-from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.messages import Batch
 from factorbus.proto.problems import BadShape, UnknownKind
-from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
 _Kind = TypeVar("_Kind")
-_Row: TypeAlias = NDArray[np.float64]
 
 
 class Held(TypedDict, total=False):
@@ -56,9 +63,7 @@ class Draft:
     """
 
     def __init__(self) -> None:
-        self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[_Row], list[int]]] = {}
-        self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
-        self._linear: list[Factors] = []
+        self._columns = DraftColumns()
 
     def se2(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
         """A pose in the plane: x y (metres), theta (radians)."""
@@ -109,53 +114,30 @@ class Draft:
         return self.factor("prior_point3", (key,), measured, **certainty)
 
     def between_se2(
-        self,
-        first: Key,
-        second: Key,
-        measured: ArrayLike,
-        *,
-        mount: Key | ArrayLike | None = None,
-        **certainty: Unpack[Certainty],
+        self, first: Key, second: Key, measured: ArrayLike, **certainty: Unpack[OdometryCertainty]
     ) -> Draft:
         """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures.
 
-        mount: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
+        mount=: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
         off the centre moves sideways when the robot turns.  The certainty is that of the sensor, in its frame, and is
         carried over to first order in the error (`factorbus.client.lever_arm`, MATH §3.7).
         Or the key of an se2 that is estimated: the mount is to be found out (MATH §3.8).
+        scale=: the key of a vector1 that x and y are to be multiplied by, as of wheels of unknown radius (MATH §3.9).
         """
-        if mount is not None and not isinstance(mount, str | int):
-            where = self._joins(first, second, "between_se2")
-            measured, A = transform_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
-            certainty = transform_certainty(where, 3, certainty, A, "between_se2")
-            mount = None
-        return self._at_mount("between_se2", (first, second), mount, measured, certainty)
+        return self._add(odometry("between_se2", (first, second), measured, certainty))
 
     def between_se3(
-        self,
-        first: Key,
-        second: Key,
-        measured: ArrayLike,
-        *,
-        mount: Key | ArrayLike | None = None,
-        **certainty: Unpack[Certainty],
+        self, first: Key, second: Key, measured: ArrayLike, **certainty: Unpack[OdometryCertainty]
     ) -> Draft:
         """The second pose in the first one's frame: x y z (metres), qx qy qz qw.
 
         Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
         g2o: 4/s² for s radians.
 
-        mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; or the key of an
-        se3.  As in `between_se2`.
+        mount=: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; or the key of an
+        se3.  scale=: as in `between_se2`, of x y z.
         """
-        if mount is not None and not isinstance(mount, str | int):
-            where = self._joins(first, second, "between_se3")
-            measured, A = transform_se3(
-                where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7)
-            )
-            certainty = transform_certainty(where, 6, certainty, A, "between_se3")
-            mount = None
-        return self._at_mount("between_se3", (first, second), mount, measured, certainty)
+        return self._add(odometry("between_se3", (first, second), measured, certainty))
 
     def landmark_se2(self, pose: Key, point: Key, measured: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """A point2 in the pose's frame: x y (metres)."""
@@ -171,21 +153,38 @@ class Draft:
         """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
         return self._seen("bearing_range_se2", (pose, point), measured, certainty)
 
-    def position_se2(
-        self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0), **certainty: Unpack[Certainty]
-    ) -> Draft:
-        """Where an antenna is in the map: x y (metres); lever: where it is on the robot."""
-        return self.factor(
-            "position_se2", (key,), [*_row("measured", measured, 2), *_row("lever", lever, 2)], **certainty
-        )
+    def position_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[AntennaCertainty]) -> Draft:
+        """Where an antenna is in the map, or in another frame: x y (metres).
 
-    def position_se3(
-        self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0, 0.0), **certainty: Unpack[Certainty]
-    ) -> Draft:
-        """Where an antenna is in the map: x y z (metres); lever: where it is on the robot."""
-        return self.factor(
-            "position_se3", (key,), [*_row("measured", measured, 3), *_row("lever", lever, 3)], **certainty
-        )
+        lever=: where it is on the robot, x y, or the key of a vector2; frame=: the key of the se2 that is the map's
+        pose in the frame that this is measured in; offset= and twist=, of its clock (MATH §3.9).
+        """
+        return self._add(positioned("position_se2", key, measured, certainty))
+
+    def position_se3(self, key: Key, measured: ArrayLike, **certainty: Unpack[AntennaCertainty]) -> Draft:
+        """Where an antenna is in the map, or in another frame: x y z (metres).  As `position_se2`."""
+        return self._add(positioned("position_se3", key, measured, certainty))
+
+    def gnss(
+        self, key: Key, latitude: float, longitude: float, height: float, *, origin: ArrayLike,
+        **certainty: Unpack[GnssCertainty],
+    ) -> Draft:  # fmt: skip
+        """Where an antenna is on the Earth: degrees, and metres above the ellipsoid of WGS 84.
+
+        A `position_se3`, east north up (metres) of `origin`: latitude, longitude, height, near where the robot drives.
+        covariance= (3, 3) of these, m², or sigmas= (3,), metres.  lever=, offset=, twist= as in `position_se2`.
+        frame=: the key of the map's pose in that frame; without, the map itself has x to the east and y to the north.
+        """
+        there = enu((latitude, longitude, height), origin)
+        return self._add(positioned("position_se3", key, there, with_information(key, certainty)))
+
+    def velocity_frame_se2(self, frame: Key, velocity: Key, measured: ArrayLike, **sure: Unpack[Certainty]) -> Draft:
+        """A vector2, a velocity along the axes of the map, in another frame (`position_se2`): vx vy (m/s)."""
+        return self.factor("velocity_frame_se2", (frame, velocity), measured, **sure)
+
+    def velocity_frame_se3(self, frame: Key, velocity: Key, measured: ArrayLike, **sure: Unpack[Certainty]) -> Draft:
+        """The same of a vector3: where the frame is that of `gnss`, east north up (m/s), as Doppler shifts tell."""
+        return self.factor("velocity_frame_se3", (frame, velocity), measured, **sure)
 
     def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane looks, in the map: theta (radians)."""
@@ -206,13 +205,13 @@ class Draft:
         """How far a point3 is from the pose (metres)."""
         return self._seen("range_se3", (pose, point), [distance], certainty)
 
-    def range_between_se2(self, first: Key, second: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
+    def range_between_se2(self, first: Key, second: Key, distance: float, **certainty: Unpack[RangeCertainty]) -> Draft:
         """How far two poses in the plane are apart (metres): robots, or a robot and an anchor with an orientation."""
-        return self.factor("range_between_se2", (first, second), [distance], **certainty)
+        return self._add(sensed("range_between_se2", (first, second), [distance], certainty, RangeCertainty))
 
-    def range_between_se3(self, first: Key, second: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
+    def range_between_se3(self, first: Key, second: Key, distance: float, **certainty: Unpack[RangeCertainty]) -> Draft:
         """How far two poses in space are apart (metres)."""
-        return self.factor("range_between_se3", (first, second), [distance], **certainty)
+        return self._add(sensed("range_between_se3", (first, second), [distance], certainty, RangeCertainty))
 
     def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """Where a point2 is to be seen from the pose (radians, from the x axis to the left)."""
@@ -243,9 +242,9 @@ class Draft:
         """
         numbers = key_numbers(keys).tolist()
         if kinds is None:
-            known = {number: kind for (kind, *_), (keys_of, *_) in self._variables.items() for number in keys_of}
+            known = self._columns.kinds()
             kinds = [known.get(number, "") for number in numbers]
-        self._linear.append(linear_factor(numbers, values, jacobians, residual, kinds, certainty))
+        self._columns.add_linear(linear_factor(numbers, values, jacobians, residual, kinds, certainty))
         return self
 
     def idp_first(
@@ -263,7 +262,7 @@ class Draft:
         (`factorbus.client.certainty.FeatureCertainty`).
         """
         measured = [*_row("pixel", pixel, 2), rho, *_lens(camera)]
-        sigmas = feature_sigmas(self._joins(pose, feature, "idp_first"), certainty)
+        sigmas = feature_sigmas(self._named("idp_first", (pose, feature)), certainty)
         return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=certainty.get("loss"))
 
     def idp_seen(
@@ -298,12 +297,7 @@ class Draft:
         row = None if value is None else _row(where, value, size)
         checked_keywords(where, held, tuple(Held.__annotations__))
         fixed = checked_flag(f"{where}: fixed", held.get("fixed", False))
-        keys, rows, stamps = self._variables.setdefault((kind, row is not None, fixed), ([], [], []))
-        stamp = stamp_number(where, held.get("stamp"))
-        keys.append(number)
-        stamps.append(stamp)
-        if row is not None:
-            rows.append(row)
+        self._columns.add_variable(kind, number, row, fixed, stamp_number(where, held.get("stamp")))
         return self
 
     def factor(
@@ -320,61 +314,24 @@ class Draft:
         if len(numbers) != len(of.connects):
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
         row = _row(f"{where}: measured", measured, of.size)
-        name, scale = loss_of(where, certainty.get("loss"))
-        triangle = triangle_of(where, of.dim, certainty, kind)
-        all_keys, all_measured, all_triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
-        scales.append(scale)
-        all_keys.append(numbers)
-        all_measured.append(row)
-        all_triangles.append(triangle)
+        loss = loss_of(where, certainty.get("loss"))
+        self._columns.add_factor(kind, numbers, row, triangle_of(where, of.dim, certainty, kind), loss)
         return self
 
     def _seen(self, kind: str, keys: tuple[Key, Key], measured: ArrayLike, certainty: SensorCertainty) -> Draft:
-        """What a sensor measures that may have a mount."""
-        check_names(self._joins(*keys, kind), certainty, SensorCertainty)
-        rest = {name: value for name, value in certainty.items() if name != "mount"}
-        return self._at_mount(kind, keys, certainty.get("mount"), measured, cast("Certainty", rest))
+        """What a sensor measures that may have a mount, a bias, a clock."""
+        return self._add(sensed(kind, keys, measured, certainty))
 
-    def _at_mount(
-        self, kind: str, keys: tuple[Key, Key], mount: Key | None, measured: ArrayLike, certainty: Certainty
-    ) -> Draft:
-        """A factor of this kind, or where there is a mount the one whose last variable that is."""
-        if mount is None:
-            return self.factor(kind, keys, measured, **certainty)
-        return self.factor(f"{kind}_mount", (*keys, mount), measured, **certainty)
+    def _add(self, made: Measured) -> Draft:
+        return self.factor(made.kind, made.keys, made.measured, **made.certainty)
 
-    def _joins(self, first: Key, second: Key, kind: str) -> str:
+    def _named(self, kind: str, keys: tuple[Key, ...]) -> str:
         """What an error says it is about."""
-        return " ".join([kind, *(format_symbol(key_number(key)) for key in (first, second))])
+        return " ".join([kind, *(format_symbol(key_number(key)) for key in keys)])
 
     def batch(self) -> Batch:
         """What has been drafted so far, as columns."""
-        return Batch(
-            tuple(
-                Variables(
-                    kind,
-                    np.array(keys, np.int64),
-                    np.array(rows) if valued else None,
-                    fixed,
-                    np.array(stamps, np.int64) if any(stamp != NO_STAMP for stamp in stamps) else None,
-                )
-                for (kind, valued, fixed), (keys, rows, stamps) in self._variables.items()
-            ),
-            (
-                *(
-                    Factors(
-                        kind,
-                        np.array(keys, np.int64),
-                        np.array(measured),
-                        np.array(information),
-                        loss,
-                        np.array(scales) if loss else None,
-                    )
-                    for (kind, loss), (keys, measured, information, scales) in self._factors.items()
-                ),
-                *self._linear,
-            ),
-        )
+        return self._columns.batch()
 
 
 def batch_of(what: str, given: Batch | Draft) -> Batch:
@@ -392,7 +349,7 @@ def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
     return kinds[kind]
 
 
-def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
+def _row(where: str, numbers: ArrayLike, size: int) -> Row:
     row = as_numbers(where, numbers, f"({size},) numbers")
     if row.shape != (size,):
         raise BadShape(where, f"shape {row.shape}", f"({size},)")

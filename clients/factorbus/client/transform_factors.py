@@ -3,16 +3,17 @@
 import numpy as np
 
 from factorbus.client.frames import rotation_of
+from factorbus.client.roles import Roles
 from factorbus.client.transform_linear import transform_linear
-from factorbus.proto.arrays import F64, I64
+from factorbus.proto.arrays import F64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Factors
 
 
-def transform_factors(group: Factors, T_a_b: F64, mounts: I64) -> Factors:
-    """Relative factors given in b, as they are in a.  mounts: keys of what is on a robot, and does not move."""
+def transform_factors(group: Factors, T_a_b: F64, roles: Roles) -> Factors:
+    """Relative factors given in b, as they are in a.  roles: of variables that are no places in the map."""
     if FACTOR_KINDS[group.kind].is_linear:
-        return transform_linear(group, T_a_b, mounts)
+        return transform_linear(group, T_a_b, roles)
     return _transform_first(group, T_a_b) if group.kind == "idp_first" else group
 
 

@@ -5,10 +5,11 @@ build and read messages, and a test holds the two against each other.  A name ne
 """
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+from factorbus.proto.derived_kinds import derived_kinds
 from factorbus.wording import counted
 
 
@@ -36,7 +37,10 @@ class FactorKind:
     l of a point and y of a feature seen from pose a, m of a mount, and x, or x₁ and x₂, of others.
     example: a measurement, for the golden message of the kind
     half_angles: the last three rows of the residual are the vector part of a quaternion
-    base: the kind that this is with the pose of a sensor, whose mount on the robot is the last variable
+    base, modifiers: the kind that this is with further variables, one of each modifier (`derived_kinds`)
+    roles: by variable, "" where it is a place in the map or numbers in no frame.  "mount": a pose in the robot's frame,
+    which stays where the map moves.  "frame": the pose of the map in another frame.  "axes": a vector along the map's
+    axes
     """
 
     name: str
@@ -48,6 +52,8 @@ class FactorKind:
     example: tuple[float, ...]
     half_angles: bool = False
     base: str = ""
+    modifiers: tuple[str, ...] = ()
+    roles: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.example) != self.size:
@@ -64,6 +70,8 @@ class FactorKind:
     @property
     def is_absolute(self) -> bool:
         """Whether it is known in the map's frame, and not of variables relative to each other."""
+        if self.base:
+            return FACTOR_KINDS[self.base].is_absolute and "frame" not in self.modifiers
         return len(self.connects) == 1
 
     @property
@@ -73,8 +81,9 @@ class FactorKind:
 
     @property
     def sees_landmark(self) -> bool:
-        """Whether it connects a pose with what is no pose."""
-        return not self.is_linear and [VARIABLE_KINDS[end].is_pose for end in self.connects] == [True, False]
+        """Whether it connects a pose with a point or a feature."""
+        ends = [VARIABLE_KINDS[end] for end in self.connects]
+        return not (self.is_linear or ends[-1].is_vector) and [end.is_pose for end in ends] == [True, False]
 
 
 _POSE2 = "x y (metres), theta (radians)"
@@ -176,19 +185,6 @@ class FactorKinds(dict[str, FactorKind]):
             except ValueError as why:
                 return (f"{LINEAR_NAME} ({why})",)
         return (*self, LINEAR_NAME)
-
-
-_WITH_MOUNT = (
-    *("between_se2", "between_se3", "landmark_se2", "landmark_se3", "bearing_range_se2", "bearing_se2", "bearing_se3"),
-    *("range_se2", "range_se3", "point_seen"),
-)
-
-
-def _with_mount(kind: FactorKind) -> FactorKind:
-    """`kind` as measured by a sensor at m on the robot: with a ∘ m in place of the pose a."""
-    instead = "a ∘ m and b ∘ m for a and b" if kind.connects[0] == kind.connects[1] else "a ∘ m for a"
-    ends, residual = (*kind.connects, kind.connects[0]), f"that of {kind.name} with {instead}"
-    return replace(kind, name=f"{kind.name}_mount", connects=ends, residual=residual, base=kind.name)
 
 
 FACTOR_KINDS = FactorKinds(
@@ -330,10 +326,30 @@ FACTOR_KINDS = FactorKinds(
             "u/‖u‖ − z/‖z‖, u = Rₐᵀ (l − tₐ)",
             (2.0, 1.0, 0.5),
         ),
+        FactorKind(
+            "velocity_frame_se2",
+            ("se2", "vector2"),
+            2,
+            2,
+            "vx vy in the frame f (m/s), as Doppler shifts tell",
+            "R_f v − z, v along the axes of the map",
+            (1.5, -0.5),
+            roles=("frame", "axes"),
+        ),
+        FactorKind(
+            "velocity_frame_se3",
+            ("se3", "vector3"),
+            3,
+            3,
+            "vx vy vz in the frame f (m/s), as Doppler shifts tell",
+            "R_f v − z, v along the axes of the map",
+            (1.5, -0.5, 0.25),
+            roles=("frame", "axes"),
+        ),
     )
 )
-# And those of a sensor whose mount is estimated: of all that one pose measures of another, or of a point.
-FACTOR_KINDS.update((f"{name}_mount", _with_mount(FACTOR_KINDS[name])) for name in _WITH_MOUNT)
+# And those that these become with further variables: a mount, a bias, a scale, another frame, a lever arm, a clock.
+FACTOR_KINDS.update([(kind.name, kind) for kind in derived_kinds(FACTOR_KINDS)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,7 @@ from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
+from factorbus.solver.kernels.model.kinds import JOINS_PLACES
 from factorbus.solver.optimize.gauss_newton import StoppingRule, minimize
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
@@ -97,9 +98,9 @@ def find_loops(graph: FactorGraph) -> I64:
         above[v] = count  # the ground
     loops = []
     fac = graph.fac[: graph.counts[at.FACTORS]]
-    for f in np.flatnonzero(is_first(fac)).tolist():  # the first row of three variables is without the mount
+    for f in np.flatnonzero(is_first(fac)).tolist():  # its first row is without a mount, a bias, and the like
         i, j = fac[f, at.F_I : at.F_J + 1].tolist()
-        if j < 0:
+        if j < 0 or not JOINS_PLACES[fac[f, at.F_KIND]]:
             continue
         if fac[f, at.F_KIND] == at.LINEAR and len(ends := graph.ends_of(f)) > 2:
             for v in ends[1:]:

@@ -17,6 +17,7 @@ from factorbus.solver.kernels.graph.initialize import join, reach
 from factorbus.solver.kernels.graph.observability import mark_determined
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import ABSOLUTE
 from factorbus.solver.sparse.blocks import HessianBlocks
 
 # A variance this many times what the variable's own factors alone would leave is no longer a number.
@@ -70,7 +71,8 @@ def find_unanchored(graph: FactorGraph, since: Mark) -> int:
     anchored = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
     fac = graph.fac[factors[0] : factors[1]]
     linear = rows_of_factors(fac, np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR))
-    anchors = np.concatenate([fac[fac[:, at.F_J] < 0, at.F_I], fac[linear, at.F_I], fac[linear, at.F_J]])
+    told = (fac[:, at.F_J] < 0) | ABSOLUTE[fac[:, at.F_KIND]]
+    anchors = np.concatenate([fac[told, at.F_I], fac[linear, at.F_I], fac[linear, at.F_J]])
     anchored[anchors[anchors >= first] - first] = 1
     return int(join(first, last, *factors, graph.fac, anchored, np.empty(last - first + 1, np.int64)))
 

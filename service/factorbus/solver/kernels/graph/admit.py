@@ -19,7 +19,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find_outside
 from factorbus.solver.kernels.model.factor_rows import row_of_pair, rows_of_arity
-from factorbus.solver.kernels.model.kinds import is_camera
+from factorbus.solver.kernels.model.kinds import base_kind, is_camera
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import (
     arity_of,
@@ -138,7 +138,7 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
     triangle, ends, kinds = dim * (dim + 1) // 2, np.empty(arity, np.int64), np.empty(arity, np.int64)
     for n in range(arity):
         kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if kind == at.LINEAR else kind_of_end(kind, n)
-    is_many, scratch = kind == at.LINEAR or arity > 2, np.empty((dim, dim))
+    is_many, scratch = kind == at.LINEAR or base_kind(kind) >= 0, np.empty((dim, dim))
     rest = gt.OBSERVED if is_camera(kind) else 0
     for n in range(group[gt.G_COUNT]):
         p, first = counts[at.PAYLOAD], group[gt.G_KEYS] + 8 * n * arity
