@@ -86,7 +86,7 @@ class Draft:
         return self.variable("idp", key, value, **held)
 
     def vector(self, key: Key, value: ArrayLike, **held: Unpack[Held]) -> Draft:
-        """One to nine numbers of any units, which no frame moves: a velocity, a bias, a scale, an offset of clocks.
+        """One to nine numbers of any units, which no frame moves: a bias, a scale, an offset of clocks, a velocity.
 
         What is known of it is said by `linear`; no factor gives it a value.
         """
