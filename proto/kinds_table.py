@@ -5,6 +5,7 @@ python proto/kinds_table.py        a test compares
 
 from pathlib import Path
 
+from factorbus.proto import inertial
 from factorbus.proto.kinds import FACTOR_KINDS, LINEAR_NAME, VARIABLE_KINDS, FactorKind
 
 README = Path(__file__).with_name("README.md")
@@ -12,9 +13,11 @@ _HEAD = """\
 | factor | connects | measured z | residual r (its order is the order of the information matrix) |
 |---|---|---|---|
 """
-_LINEAR = (
+_FAMILIES = (
     f"| `{LINEAR_NAME}` | any x₁, x₂, … | y of each variable, H of each (rows x its scalars, row by row), b (rows) "
     "| Σ Hₙ (xₙ ⊟ yₙ) + b |\n"
+    f"| `{inertial.NAME}` | se3 a, vector3 vₐ, vector6 βₐ, se3 b, vector3 v_b, vector6 β_b | {inertial.MEASURED} "
+    f"| {inertial.DIFFERENCE} |\n"
 )
 
 
@@ -25,11 +28,11 @@ def main() -> None:
 
 
 def table() -> str:
-    """A row for each kind, and one for linear factors."""
+    """A row for each kind, and one for each family of kinds: linear and inertial factors."""
     rows = [
         f"| `{kind.name}` | {_ends(kind)} | {kind.measured} | {kind.residual} |\n" for kind in FACTOR_KINDS.values()
     ]
-    return _HEAD + "".join(rows) + _LINEAR
+    return _HEAD + "".join(rows) + _FAMILIES
 
 
 def found(text: str) -> str:

@@ -21,7 +21,7 @@ import msgpack
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind, linear_kind
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind, imu_kind, linear_kind
 from factorbus.proto.messages import (
     Batch,
     Change,
@@ -67,6 +67,7 @@ def vectors() -> dict[str, bytes]:
         "insert_observations": codec.encode_insert(Insert(5, _observations(), epoch=7)),
         "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
         "insert_mounts": codec.encode_insert(Insert(10, _mounts(), epoch=7)),
+        "insert_inertial": codec.encode_insert(Insert(11, _inertial(), epoch=7)),
         "insert_linear_kinds": codec.encode_insert(Insert(9, _linear_kinds(), epoch=7)),
         "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, convert_below=0.1)),
         "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
@@ -217,6 +218,27 @@ def _mounts() -> Batch:
             unit = np.eye(kind.dim)[np.triu_indices(kind.dim)]
             groups.append(Factors(name, keys, np.array([kind.example]), unit[None]))
     return Batch(factors=tuple(groups))
+
+
+def _inertial() -> Batch:
+    """An IMU's samples between two moments; what is known of the first of them."""
+    before, after = ([symbol(letter, n) for letter in "xvb"] for n in (1, 2))
+    kind, kinds = imu_kind(2), ("se3", "vector3", "vector6")
+    first = [0.0] * 6 + [1.0], [1.5, 0.25, 0.0], [0.0] * 6
+    return Batch(
+        (
+            *(Variables(of, np.array([key]), np.array([x])) for of, key, x in zip(kinds, before, first, strict=True)),
+            *(Variables(of, np.array([key])) for of, key in zip(kinds, after, strict=True)),
+        ),
+        (
+            Factors(
+                kind.name,
+                np.array([[*before, *after]]),
+                np.array([kind.example]),
+                np.eye(kind.dim)[np.triu_indices(kind.dim)][None],
+            ),
+        ),
+    )
 
 
 def _observations() -> Batch:

@@ -4,7 +4,7 @@ Nothing here shares a formula with them: poses are homogeneous matrices, Jacobia
 """
 
 import numpy as np
-from naive import dense_idp
+from naive import dense_idp, dense_imu
 from scipy.spatial.transform import Rotation
 
 from factorbus.proto.camera import Camera
@@ -56,6 +56,8 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
         return _observation(kind, *ends, z)
     if kind.startswith("linear"):
         return _linear(kind, ends, z)
+    if kind.startswith("imu"):
+        return dense_imu.residual(ends, z)
     if kind.startswith(("position", "heading", "attitude")):
         return _absolute(kind, ends[0], z)
     if kind.startswith("prior_point"):

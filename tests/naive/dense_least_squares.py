@@ -5,9 +5,11 @@ from naive.dense_factors import TANGENT, boxplus, jacobians, linear_ends, residu
 
 
 class Connects(dict[str, list[str]]):
-    """The kinds of the variables of each kind of factor; a linear one has them in its name."""
+    """The kinds of the variables of each kind of factor: in the name of a linear one, the same of all inertial ones."""
 
     def __missing__(self, kind: str) -> list[str]:
+        if kind.startswith("imu_"):
+            return ["se3", "vector3", "vector6"] * 2
         assert kind.startswith("linear_"), kind
         return linear_ends(kind)
 

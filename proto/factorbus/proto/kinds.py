@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+from factorbus.proto import inertial
 from factorbus.wording import counted
 
 
@@ -37,6 +38,7 @@ class FactorKind:
     example: a measurement, for the golden message of the kind
     half_angles: the last three rows of the residual are the vector part of a quaternion
     base: the kind that this is with the pose of a sensor, whose mount on the robot is the last variable
+    roles: by variable, "axes" of a vector along the map's axes, which turns with the map, and "" of others
     """
 
     name: str
@@ -48,6 +50,7 @@ class FactorKind:
     example: tuple[float, ...]
     half_angles: bool = False
     base: str = ""
+    roles: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.example) != self.size:
@@ -70,6 +73,11 @@ class FactorKind:
     def is_linear(self) -> bool:
         """Whether it is a linear model of its variables."""
         return self.name.startswith(_LINEAR)
+
+    @property
+    def samples(self) -> int:
+        """How many samples of an IMU it has; 0: it is of no IMU."""
+        return inertial.samples_of(self.name) if self.name.startswith(inertial.PREFIX) else 0
 
     @property
     def sees_landmark(self) -> bool:
@@ -128,6 +136,24 @@ def linear_kind(rows: int, ends: tuple[str, ...]) -> FactorKind:
     return FactorKind(name, ends, size, rows, measured, "Σ Hₙ (xₙ ⊟ yₙ) + b", (*y, *[0.25] * (size - values)))
 
 
+@lru_cache(maxsize=1024)
+def imu_kind(samples: int) -> FactorKind:
+    """The kind of inertial factors with that many samples.  Raises ValueError: none, or too many."""
+    name, example = inertial.name_of(samples), (*inertial.EXAMPLE, *inertial.EXAMPLE_SAMPLE * samples)
+    texts = inertial.MEASURED, inertial.DIFFERENCE
+    return FactorKind(name, inertial.ENDS, len(example), inertial.RESIDUAL, *texts, example, roles=inertial.ROLES)
+
+
+def _of_name(name: str) -> FactorKind | None:
+    """The linear or inertial kind of that name; None: there is none."""
+    if not name.startswith(inertial.PREFIX):
+        return _linear_of_name(name)
+    try:
+        return imu_kind(inertial.samples_of(name))
+    except ValueError:
+        return None
+
+
 def _linear_of_name(name: str) -> FactorKind | None:
     """The linear kind of that name; None: there is none."""
     if not name.startswith(_LINEAR) or len(name) > _LONGEST:
@@ -147,35 +173,39 @@ def _read_linear(name: str) -> FactorKind:
 
 
 class FactorKinds(dict[str, FactorKind]):
-    """The kinds by name.  Those of linear factors, of which there is one for any rows and variables, are found by name
-    as well, and are not among the entries."""
+    """The kinds by name.  Those of linear factors, one for any rows and variables, and of inertial factors, one for any
+    number of samples, are found by name as well, and are not among the entries."""
 
     def __missing__(self, name: str) -> FactorKind:
-        if (kind := _linear_of_name(name)) is None:
+        if (kind := _of_name(name)) is None:
             raise KeyError(name)
         return kind
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or (isinstance(name, str) and _linear_of_name(name) is not None)
+        return super().__contains__(name) or (isinstance(name, str) and _of_name(name) is not None)
 
     def get(self, name: str, default: Any = None) -> Any:
         """The kind of that name, or `default`."""
         found = super().get(name)
-        return found or _linear_of_name(name) or default
+        return found or _of_name(name) or default
 
     def names(self, unknown: str = "") -> tuple[str, ...]:
-        """For a person: all names, and the form of those of linear factors.
+        """For a person: all names, and the forms of those of linear and inertial factors.
 
         Of an `unknown` one that begins as these do, what is wrong with it.
         """
-        if unknown.startswith(_LINEAR):
-            if len(unknown) > _LONGEST:
-                return (f"{LINEAR_NAME}, of up to {MOST_JOINED} variables",)
-            try:
-                _read_linear(unknown)
-            except ValueError as why:
-                return (f"{LINEAR_NAME} ({why})",)
-        return (*self, LINEAR_NAME)
+        if unknown.startswith(_LINEAR) and len(unknown) > _LONGEST:
+            return (f"{LINEAR_NAME}, of up to {MOST_JOINED} variables",)
+        for prefix, form, read in (
+            (_LINEAR, LINEAR_NAME, _read_linear),
+            (inertial.PREFIX, inertial.NAME, inertial.samples_of),
+        ):
+            if unknown.startswith(prefix):
+                try:
+                    read(unknown)
+                except ValueError as why:
+                    return (f"{form} ({why})",)
+        return (*self, LINEAR_NAME, inertial.NAME)
 
 
 _WITH_MOUNT = (

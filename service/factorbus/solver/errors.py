@@ -17,6 +17,7 @@
     ├── BadQuaternion          bad_quaternion          a quaternion that is not of unit length
     ├── BadRange               bad_range               a range that is not positive
     ├── BadDirection           bad_direction           a direction that is no vector of some length
+    ├── BadSamples             bad_samples             samples of an IMU without duration, or noise that cannot be
     ├── BadLens                bad_lens                a lens that cannot be
     ├── BadObservation         bad_observation         a pixel of what the camera cannot see
     ├── BadLoss                bad_loss                a loss that does not exist, or a scale that is not positive
@@ -233,6 +234,13 @@ class BadDirection(SolverError):
             seen="length 0",
             wanted="a vector of any other length",
         )
+
+
+class BadSamples(SolverError):
+    code = "bad_samples"
+
+    def __init__(self, where: str, seen: str, wanted: str) -> None:
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=seen, wanted=wanted)
 
 
 class BadLens(SolverError):

@@ -27,7 +27,7 @@ def carry_along(graph: FactorGraph, values: F64, placed: np.ndarray, stays: np.n
     known = (placed | (graph.var[: placed.size, at.V_COLUMN] < 0)) & stays
     fac = graph.fac[: kept.size]
     joins = is_first(fac)  # of a sensor with a mount the first two variables: the mount is not in the map
-    joins[rows_of_factors(fac, np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR))] = True
+    joins[rows_of_factors(fac, np.flatnonzero(np.isin(fac[:, at.F_KIND], (at.LINEAR, at.IMU))))] = True
     ends = fac[kept & (fac[:, at.F_J] >= 0) & joins][:, [at.F_I, at.F_J]]
     ends = ends[~VECTOR[kind[ends]].any(axis=1)]
     ends = np.concatenate([ends, ends[:, ::-1]])  # (from, to)

@@ -89,7 +89,7 @@ def repair(graph: FactorGraph, factors: I64 | None = None, probability: float = 
 def find_loops(graph: FactorGraph) -> I64:
     """Rows of the factors between variables that factors before them, or being fixed, join already.
 
-    Linear factors of more than two variables, which marginals are, join, and are no suspects.
+    Linear factors of more than two variables, which marginals are, and inertial ones join, and are no suspects.
     """
     count = int(graph.counts[at.VARIABLES])
     above = list(range(count + 1))
@@ -101,7 +101,7 @@ def find_loops(graph: FactorGraph) -> I64:
         i, j = fac[f, at.F_I : at.F_J + 1].tolist()
         if j < 0:
             continue
-        if fac[f, at.F_KIND] == at.LINEAR and len(ends := graph.ends_of(f)) > 2:
+        if fac[f, at.F_KIND] in (at.LINEAR, at.IMU) and len(ends := graph.ends_of(f)) > 2:
             for v in ends[1:]:
                 _join(above, ends[0], v)
         elif not _join(above, i, j):

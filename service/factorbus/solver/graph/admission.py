@@ -6,11 +6,12 @@ in use; what concerns rows together is checked when all are there.
 
 import numpy as np
 
+from factorbus.proto import inertial
 from factorbus.solver import errors
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.columns import Columns, floats_at, ints_at, limit_lenses, locate_columns
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, linear_of
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, imu_of, linear_of
 from factorbus.solver.graph.groups import BatchLike
 from factorbus.solver.graph.triangulation import place_by_bearings
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -130,8 +131,10 @@ def _find_bad_row(graph: FactorGraph, raw: bytes, group: I64, n: int, fault: int
 
 def _kind_of(raw: bytes, group: I64) -> FactorKind:
     """The kind of a group of factors."""
-    if group[gt.G_KIND] != at.LINEAR:
-        return FACTOR_KIND_OF_CODE[int(group[gt.G_KIND])]
+    if (code := int(group[gt.G_KIND])) < at.LINEAR:
+        return FACTOR_KIND_OF_CODE[code]
+    if code == at.IMU:
+        return imu_of((int(group[gt.G_SIZE]) - inertial.SAMPLES) // inertial.SAMPLE)
     ends = ints_at(raw, int(group[gt.G_ENDS]), int(group[gt.G_ARITY]))
     return linear_of(int(group[gt.G_ROWS]), tuple(ends.tolist()))
 
@@ -165,11 +168,27 @@ def _bad_factor(
         return errors.BadRange(where, float(measured[min(1, kind.size - 1)]))
     if wrong == gt.BAD_DIRECTION:
         return errors.BadDirection(where)
+    if wrong == gt.BAD_DURATION:
+        durations = measured[inertial.SAMPLES :: inertial.SAMPLE]
+        sample = int(np.flatnonzero(~(durations > 0.0))[0])
+        return errors.BadSamples(where, f"sample {sample} lasts {durations[sample]:g} s", "more than 0 s")
+    if wrong == gt.BAD_NOISE:
+        return _bad_noise(where, measured)
     if wrong == gt.NOT_POSITIVE_DEFINITE:
         matrix = np.zeros((kind.dim, kind.dim))
         matrix[np.triu_indices(kind.dim)] = information
         return errors.NotPositiveDefinite(where, float(np.linalg.eigvalsh(matrix, UPLO="U")[0]))
     return _number_out_of_bounds(kind, where, measured, information)
+
+
+def _bad_noise(where: str, measured: F64) -> errors.SolverError:
+    """A noise density is not positive, or the covariance of Δ is singular, as that of one sample is."""
+    noise = measured[: inertial.GRAVITY]
+    if (noise[: inertial.INTEGRATION] > 0.0).all() and noise[inertial.INTEGRATION] >= 0.0:
+        seen = f"the covariance of Δ is singular with noise of integration {noise[inertial.INTEGRATION]:g} m/√s"
+        return errors.BadSamples(where, seen, "a larger one, 1e-4 say, or more samples")
+    seen = ", ".join(f"{number:g}" for number in noise.tolist())
+    return errors.BadSamples(where, f"noise densities {seen}", "all above 0, and the last, of integration, 0 or more")
 
 
 def _worst_norm(kind: FactorKind, measured: F64) -> float:

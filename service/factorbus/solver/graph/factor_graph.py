@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from factorbus.proto import inertial
 from factorbus.solver.errors import printed
 from factorbus.solver.graph.arenas import Arenas, lines
 from factorbus.solver.graph.factor_rows import (
@@ -22,7 +23,7 @@ from factorbus.solver.graph.factor_rows import (
     losses_of,
     rows_of_arities,
 )
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, linear_of
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, imu_of, linear_of
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.graph.rows import Rows, Span
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -37,9 +38,11 @@ from factorbus.solver.kernels.model.retract import common_label, gather_values
 Mark: TypeAlias = tuple[int, ...]
 
 _MUCH = 4096  # rows
-# By the code of a kind; the last two are of linear factors, whose sizes are their own, and of members.
-_MEASURED = np.array([*(FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)), 0, 0], np.int64)
-_TRIANGLE = np.array([*(FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)), 0, 0], np.int64)
+# By the code of a kind; the last three are of linear factors, whose sizes are their own, of members, and of inertial
+# factors.
+_MEASURED = np.array([*(FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)), 0, 0, 0], np.int64)
+_TRIANGLE = np.array([*(FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)), 0, 0, 0], np.int64)
+_SIZED = (at.LINEAR, at.IMU)
 _NO_KEYS: I64 = np.empty(0, np.int64)
 
 
@@ -250,8 +253,10 @@ class FactorGraph(Arenas):
     def kind_of(self, row: int) -> FactorKind:
         """The kind of the factor that begins at a row."""
         code, flags = (int(n) for n in self.fac[row, [at.F_KIND, at.F_FLAGS]])
-        if code != at.LINEAR:
+        if code < at.LINEAR:
             return FACTOR_KIND_OF_CODE[code]
+        if code == at.IMU:
+            return imu_of(flags >> at.SAMPLES_SHIFT & at.SAMPLES_MASK)
         return linear_of(flags >> at.DIM_SHIFT, tuple(self.var[self.ends_of(row), at.V_KIND].tolist()))
 
     def kinds_of(self, rows: I64) -> list[tuple[FactorKind, I64]]:
@@ -259,22 +264,22 @@ class FactorGraph(Arenas):
         codes, found = self.fac[rows, at.F_KIND], list[tuple[FactorKind, I64]]()
         for code in np.flatnonzero(np.bincount(codes)).tolist() if rows.size else ():
             of = rows[codes == code]
-            if code != at.LINEAR:
+            if code < at.LINEAR:
                 found.append((FACTOR_KIND_OF_CODE[code], of))
                 continue
-            linear: dict[FactorKind, list[int]] = {}
+            sized: dict[FactorKind, list[int]] = {}
             for row in of.tolist():
-                linear.setdefault(self.kind_of(row), []).append(row)
-            found += [(kind, np.array(of_kind)) for kind, of_kind in linear.items()]
+                sized.setdefault(self.kind_of(row), []).append(row)
+            found += [(kind, np.array(of_kind)) for kind, of_kind in sized.items()]
         return found
 
     def sizes_of(self, rows: I64) -> tuple[I64, I64]:
-        """(numbers measured, numbers of the information) of each of these rows; none of those that begin no factor."""
+        """(numbers before the information, numbers of it) of each of these rows; none of those that begin no factor."""
         fac = self.fac[rows]
         measured, triangle = _MEASURED[fac[:, at.F_KIND]], _TRIANGLE[fac[:, at.F_KIND]]
-        for k in np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR).tolist():
+        for k in np.flatnonzero(np.isin(fac[:, at.F_KIND], _SIZED)).tolist():
             kind = self.kind_of(int(rows[k]))
-            measured[k], triangle[k] = kind.size, kind.triangle
+            measured[k], triangle[k] = kind.stored, kind.triangle
         return measured, triangle
 
     def factors(self, most: int | None = None) -> list[FactorGroup]:
@@ -294,7 +299,7 @@ class FactorGraph(Arenas):
         ends = self.keys[ends_of_rows(fac, rows, len(kind.connects))]
         width = kind.width + (1 if loss else 0)
         numbers = self.payload[picked[:, at.F_AT, None] + np.arange(width)]
-        measured, information, scale = np.hsplit(numbers, [kind.size, kind.width])
+        measured, _, information, scale = np.hsplit(numbers, [kind.size, kind.stored, kind.width])
         own = scale[:, 0].copy() if loss else None
         return FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own, self.ids_of(rows))
 
@@ -329,11 +334,11 @@ class FactorGraph(Arenas):
 
 
 def _shape(group: I64) -> tuple[int, int]:
-    """(variables, numbers of a measurement and its information) of each factor of a group."""
-    if group[gt.G_KIND] == at.LINEAR:
-        rows = int(group[gt.G_ROWS])
-        return int(group[gt.G_ARITY]), int(group[gt.G_SIZE]) + rows * (rows + 1) // 2
-    kind = FACTOR_KIND_OF_CODE[int(group[gt.G_KIND])]
+    """(variables, numbers without the scale of a loss) of each factor of a group."""
+    if (code := int(group[gt.G_KIND])) >= at.LINEAR:
+        rows, kept = int(group[gt.G_ROWS]), inertial.KEPT if code == at.IMU else 0
+        return int(group[gt.G_ARITY]), int(group[gt.G_SIZE]) + kept + rows * (rows + 1) // 2
+    kind = FACTOR_KIND_OF_CODE[code]
     return len(kind.connects), kind.width
 
 

@@ -23,6 +23,8 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 _LOOSE = 1e12
 # The share of its diagonal that the least known direction of a linear factor has to keep, for it to determine.
 _ROOM = 1e-8
+# Kinds that may determine several variables together.
+_TOGETHER = (at.LINEAR, at.IMU)
 _NONE = np.empty(0, np.int64)
 
 
@@ -44,10 +46,10 @@ def find_undetermined(graph: FactorGraph, since: Mark) -> I64:
 
 def _mark_together(graph: FactorGraph, since: Mark, determined: I64) -> bool:
     """Set to 1 in `determined` what one linear factor determines with several variables together, as a marginal of the
-    map's anchor does; gives whether there is any."""
+    map's anchor does, or an inertial one; gives whether there is any."""
     first, found = since[at.VARIABLES], False
     fac = graph.fac[since[at.FACTORS] : graph.counts[at.FACTORS]]
-    for row in (since[at.FACTORS] + np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR)).tolist():
+    for row in (since[at.FACTORS] + np.flatnonzero(np.isin(fac[:, at.F_KIND], _TOGETHER))).tolist():
         loose = [v for v in graph.ends_of(row) if v >= first and not determined[v - first]]
         scalars = int(graph.dims[graph.var[loose, at.V_COLUMN]].sum())
         if len(loose) > 1 and graph.kind_of(row).dim >= scalars:

@@ -6,8 +6,10 @@ before it are in the graph then, for the function that names the fault, and the 
 
 import numpy as np
 
+from factorbus.proto import inertial
 from factorbus.solver.kernels.graph import group_table as gt
 from factorbus.solver.kernels.graph.check_rows import (
+    check_imu,
     check_information,
     check_linear,
     check_measurement,
@@ -24,6 +26,7 @@ from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import (
     arity_of,
     dim_of,
+    has_own_sizes,
     information_at,
     kind_of_end,
     kinds_of_ends,
@@ -84,7 +87,9 @@ def check_room(groups: I64, graph: Graph) -> int:
         else:
             arity, dim, size = shape_of(groups[g])
             factors += count * rows_of_arity(arity)
-            measured += count * (size + dim * (dim + 1) // 2 + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0))
+            measured += count * (
+                size + kept_of(kind) + dim * (dim + 1) // 2 + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0)
+            )
             if is_camera(kind) and groups[g, gt.G_LIMITED] == 0:
                 return gt.NO_LIMITS
         g += 1
@@ -124,9 +129,15 @@ def append_variables(raw: bytes, group: I64, graph: Graph) -> tuple:
 def shape_of(group: I64) -> tuple:
     """(variables, numbers of a residual, numbers measured) of each factor of a group."""
     kind = group[gt.G_KIND]
-    if kind == at.LINEAR:
+    if has_own_sizes(kind):
         return group[gt.G_ARITY], group[gt.G_ROWS], group[gt.G_SIZE]
     return arity_of(kind), residual_dim(kind), information_at(kind)
+
+
+@inline_kernel
+def kept_of(kind: int) -> int:
+    """Numbers that are kept behind the measurement of a kind, and follow from it."""
+    return inertial.KEPT if kind == at.IMU else 0
 
 
 @part
@@ -137,8 +148,8 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
     arity, dim, size = shape_of(group)
     triangle, ends, kinds = dim * (dim + 1) // 2, np.empty(arity, np.int64), np.empty(arity, np.int64)
     for n in range(arity):
-        kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if kind == at.LINEAR else kind_of_end(kind, n)
-    is_many, scratch = kind == at.LINEAR or arity > 2, np.empty((dim, dim))
+        kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if has_own_sizes(kind) else kind_of_end(kind, n)
+    is_many, scratch, stored = has_own_sizes(kind) or arity > 2, np.empty((dim, dim)), size + kept_of(kind)
     rest = gt.OBSERVED if is_camera(kind) else 0
     for n in range(group[gt.G_COUNT]):
         p, first = counts[at.PAYLOAD], group[gt.G_KEYS] + 8 * n * arity
@@ -150,13 +161,13 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
         if fault != gt.GOOD:
             return n, fault, rest
         copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p)
-        copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
-        fault = check_linear(kinds, p, size, payload) if kind == at.LINEAR else check_measurement(kind, p, payload)
+        copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + stored)
+        fault = check_measured(kind, kinds, p, size, payload)
         if fault == gt.GOOD:
-            fault = check_information(dim, p + size, payload, scratch)
+            fault = check_information(dim, p + stored, payload, scratch)
         if fault != gt.GOOD:
             return n, fault, rest
-        numbers = size + triangle
+        numbers = stored + triangle
         if loss != at.NO_LOSS:
             scale = float_at(raw, group[gt.G_SCALE] + 8 * n)
             if not (scale >= LEAST_SCALE and scale <= MOST_NUMBER):
@@ -165,9 +176,26 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
             numbers += 1
         if is_many:
             append_factor_rows(kind, loss, dim, ends, numbers, graph)
+            if kind == at.IMU:
+                add_samples(size, len(ends), graph)
         else:
             append_factor(kind, loss, i, j, numbers, graph)
     return -1, gt.GOOD, rest
+
+
+@inline_kernel
+def check_measured(kind: int, kinds: I64, p: int, size: int, payload: F64) -> int:
+    """What is wrong with a new measurement of a kind, which starts at p."""
+    if kind == at.LINEAR:
+        return check_linear(kinds, p, size, payload)
+    return check_imu(p, size, payload) if kind == at.IMU else check_measurement(kind, p, payload)
+
+
+@inline_kernel
+def add_samples(size: int, ends: int, graph: Graph) -> None:
+    """The newest factor is an inertial one with a measurement of that size."""
+    first = graph.counts[at.FACTORS] - rows_of_arity(ends)
+    graph.fac[first, at.F_FLAGS] |= (size - inertial.SAMPLES) // inertial.SAMPLE << at.SAMPLES_SHIFT
 
 
 @inline_kernel

@@ -16,7 +16,7 @@ G_INFORMATION = 7  # of the upper triangles of the information matrices
 G_SCALE = 8  # of the scales of the loss; NOWHERE: there is none
 G_STAMPS = 9  # of the time stamps of variables; NOWHERE: they have none
 G_LIMITED = 10  # 1: the lenses of what a camera saw have their limits
-G_ARITY = 11  # of linear factors, whose sizes are no other kind's: how many variables they have,
+G_ARITY = 11  # of linear and inertial factors, whose sizes are their own: how many variables they have,
 G_ROWS = 12  # numbers of a residual,
 G_SIZE = 13  # numbers measured of each factor,
 G_ENDS = 14  # and the offset of the codes of the kinds of their variables, as int64; of all others NOWHERE
@@ -39,6 +39,8 @@ BAD_RANGE = 9
 NOT_POSITIVE_DEFINITE = 10
 BAD_SCALE = 11
 BAD_DIRECTION = 12
+BAD_DURATION = 16  # a sample of an IMU that lasts no time
+BAD_NOISE = 17  # a sensor without noise, or whose noise leaves something certain
 
 # Of a factor that `many` evaluates: for each variable before the one that is wrong, to what is wrong of the first.
 LATER_END = 100

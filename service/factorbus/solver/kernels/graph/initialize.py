@@ -9,7 +9,8 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import place_idp
-from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of, is_one_of_many
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of, is_one_of_many, sample_count
+from factorbus.solver.kernels.model.imu import BIAS_B, POSE_B, place_by_imu
 from factorbus.solver.kernels.model.kinds import base_kind, initializes
 from factorbus.solver.kernels.model.many import POSE, copy_pose, put_sensor
 from factorbus.solver.kernels.model.records import Graph, graph_at
@@ -118,6 +119,8 @@ def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F
     two variables.  A mount follows from nothing, and all else from it.
     """
     of, count, missing = base_kind(fac[f, at.F_KIND]), 0, -1
+    if fac[f, at.F_KIND] == at.IMU:
+        return follow_imu(compose, f, v0, var, fac, x, p, reached)
     if of < 0 or not initializes(of):  # a linear factor
         return _NOTHING
     for n in range(count_ends(f, fac)):
@@ -145,6 +148,29 @@ def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F
                 compose_inverse_se3(y, 2 * POSE, y, 0, out)
         for c in range(size_of(kind)):
             x[var[new, at.V_AT] + c] = y[out + c]
+    reached[new - v0] = 1
+    return new
+
+
+@part
+def follow_imu(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
+    """The same of an inertial factor: pose, velocity and bias at its end follow from those at its beginning, one with
+    each of its rows, and nothing the other way."""
+    missing = -1
+    for n in range(BIAS_B, -1, -1):
+        v = end_of(f, n, fac)
+        if v >= v0 and reached[v - v0] == 0:
+            missing = n
+    if missing < 0:
+        return _NOTHING
+    if missing < POSE_B:
+        return _WAITS
+    new = end_of(f, missing, fac)
+    if compose:
+        places = np.empty(BIAS_B + 1, np.int64)
+        for n in range(BIAS_B + 1):
+            places[n] = var[end_of(f, n, fac), at.V_AT]
+        place_by_imu(missing, x, places, sample_count(f, fac), p[fac[f, at.F_AT] :])
     reached[new - v0] = 1
     return new
 

@@ -55,7 +55,7 @@ from numba.core.typing.templates import AttributeTemplate
 from numpy.typing import NDArray
 
 from factorbus.ownership import make_private
-from factorbus.proto import kinds
+from factorbus.proto import inertial, kinds
 
 # From beside this file: a copy of them elsewhere is one by itself.
 from . import releases
@@ -331,6 +331,6 @@ event.register("numba:compile", _COMPILATIONS)
 
 _KERNELS = Path(__file__).parents[1]
 _LENSES = _KERNELS.with_name("lenses")
-WIRE_KINDS = Path(kinds.__file__)  # kernels have its names and sizes as constants
-_FOLDER = KernelFolder(_KERNELS, "kernels", also=(*_LENSES.glob("*.py"), WIRE_KINDS))
+WIRE_KINDS = Path(kinds.__file__), Path(inertial.__file__)  # kernels have their names and sizes as constants
+_FOLDER = KernelFolder(_KERNELS, "kernels", also=(*_LENSES.glob("*.py"), *WIRE_KINDS))
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

@@ -142,12 +142,13 @@ def check_kinds() -> None:
 
 
 check_kinds()
-# The last two are in place of a kind's for linear factors, which `many` evaluates, and for members of a factor of more
-# than two variables, which are not looked at alone.
+# The last three are in place of a kind's for linear and inertial factors, which `many` evaluates, and between them for
+# members of a factor of more than two variables, which are not looked at alone.
 _MODELS = (
     *(FACTOR_MODELS[name] for name in FACTOR_KINDS),
     FactorModel(prior_point2, "MATH (3.26)"),
     FactorModel(prior_point2, "", bounded=True),
+    FactorModel(prior_point2, "MATH (3.55)"),
 )
 
 
@@ -173,7 +174,7 @@ BOUNDED = np.array([model.bounded for model in _MODELS])
 # By the code of a kind of variables.
 POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])
 VECTOR = np.array([kind.is_vector for kind in VARIABLE_KINDS.values()])
-SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False, False])
+SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False, False, False])
 _BASE = _table(at.FACTOR_CODES[model.base] if model.base else -1 for model in _MODELS)
 
 

@@ -1,9 +1,10 @@
 """Factors of any number of variables: residual, Jacobians and loss.  MATH §3.6, §3.8.
 
 Their Jacobians stand side by side in J, in the order of the variables, each as wide as its variable has scalars; r and
-J are times C with CᵀC = Ω, so that Ω is one from here on.  One kind is the linear model (3.26), of any variables.  The
-others are kinds of a sensor whose mount m on the robot is estimated: the residual of another kind with the sensor's
-pose c = a ∘ m in place of the robot's pose a.  With A = ∂r/∂c, and Ad(m⁻¹) what a displacement of a is of c,
+J are times C with CᵀC = Ω, so that Ω is one from here on.  One kind is the linear model (3.26), of any variables, one
+what an IMU says between two poses (`imu`).  The others are kinds of a sensor whose mount m on the robot is estimated:
+the residual of another kind with the sensor's pose c = a ∘ m in place of the robot's pose a.  With A = ∂r/∂c, and
+Ad(m⁻¹) what a displacement of a is of c,
 
     ∂r/∂a = A Ad(m⁻¹),   ∂r/∂m = A,   Ad(m⁻¹) = [ R_mᵀ | −R_mᵀ ⌊t_m⌋ ; 0 | R_mᵀ ]                        (3.35)
 
@@ -23,7 +24,9 @@ from factorbus.solver.kernels.model.factor_rows import (
     information_start,
     loss_code,
     residual_size,
+    sample_count,
 )
+from factorbus.solver.kernels.model.imu import imu
 from factorbus.solver.kernels.model.kinds import base_kind, residual_of
 from factorbus.solver.kernels.model.linear import linear
 from factorbus.solver.kernels.model.losses import loss_of
@@ -68,6 +71,8 @@ def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
     many = Many(np.zeros(max(dim, at.R_SIZE)), np.zeros((dim, start[ends])), start)
     if kind == at.LINEAR:
         linear(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
+    elif kind == at.IMU:
+        imu(x, places, sample_count(f, fac), payload[fac[f, at.F_AT] :], many.r, many.J)
     else:
         more = at_mount(kind, x, places, payload, fac[f, at.F_AT], many)
     return more, many

@@ -15,11 +15,12 @@ _SIZE = np.array([kind.size for kind in _VARIABLES], np.int64)
 _DIM = np.array([kind.dim for kind in _VARIABLES], np.int64)
 _IS_VECTOR = np.array([kind.is_vector for kind in _VARIABLES])
 MOST_SCALARS = int(_DIM.max())  # of one variable: the size of the scratch that kernels have for it
-# By the code of a kind of factor; the last two are of linear factors, whose sizes are their own, and of members.
-_RESIDUAL_DIM = np.array([*(kind.dim for kind in _FACTORS), 0, 0], np.int64)
-_MEASURED = np.array([*(kind.size for kind in _FACTORS), 0, 0], np.int64)
-_ARITY = np.array([*(len(kind.connects) for kind in _FACTORS), 0, 2], np.int64)
-_ENDS = np.full((len(_FACTORS) + 2, MOST_ENDS), -1, np.int64)
+# By the code of a kind of factor; the last three are of linear factors, whose sizes are their own, of members, and of
+# inertial factors, whose sizes are their own too.
+_RESIDUAL_DIM = np.array([*(kind.dim for kind in _FACTORS), 0, 0, 0], np.int64)
+_MEASURED = np.array([*(kind.size for kind in _FACTORS), 0, 0, 0], np.int64)
+_ARITY = np.array([*(len(kind.connects) for kind in _FACTORS), 0, 2, 0], np.int64)
+_ENDS = np.full((len(_FACTORS) + 3, MOST_ENDS), -1, np.int64)
 for _row, _kind in enumerate(_FACTORS):
     _ENDS[_row, : len(_kind.connects)] = [at.VARIABLE_CODES[end] for end in _kind.connects]
 _END_DIMS = np.where(_ENDS >= 0, _DIM[_ENDS], 0)
@@ -41,6 +42,12 @@ def dim_of(kind: int) -> int:
 def is_vector(kind: int) -> bool:
     """Whether a kind of variable is plain numbers, whose ⊞ is +."""
     return _IS_VECTOR[kind]
+
+
+@inline_kernel
+def has_own_sizes(kind: int) -> bool:
+    """Whether the sizes of a kind of factor that may begin a factor are each factor's own: linear, inertial."""
+    return kind >= at.LINEAR
 
 
 @inline_kernel
