@@ -33,7 +33,7 @@ ABSOLUTE = ("prior", "position", "heading", "attitude")
 RELATIVE = [n for n, k in FACTOR_KINDS.items() if not (n.startswith(ABSOLUTE) or k.base)]
 # Of one variable such a factor is absolute.
 JOINING = [name for name in LINEAR if len(FACTOR_KINDS[name].connects) > 1]
-NO_MOUNTS = np.empty(0, np.int64)
+NONE = np.empty(0, np.int64)
 SIGMAS = (0.1, 0.1, 0.05)
 
 
@@ -71,7 +71,7 @@ def test_a_moved_factor_says_of_moved_values_what_it_said_before(kind: str, seed
     T = random_value("se2" if connects[0].endswith("2") else "se3", rng)
     omega = random_information(FACTOR_KINDS[kind].dim, rng)
     group = Factors(kind, np.arange(len(ends))[None], z[None], omega[None])
-    moved = transform_factors(group, T, NO_MOUNTS)
+    moved = transform_factors(group, T, NONE, NONE)
     there = [moved_values(of, end[None], T)[0] for of, end in zip(connects, ends, strict=True)]
     before, after = residual(kind, ends, z), residual(kind, there, moved.measured[0])
     expected = before @ full(omega) @ before
@@ -86,7 +86,7 @@ def test_a_moved_factor_of_features_says_so_to_first_order(kind: str, seed: int)
     rng = np.random.default_rng(seed)
     ends, z = random_relative(kind, rng)
     connects, T = FACTOR_KINDS[kind].connects, random_value("se3", rng)
-    moved = transform_factors(Factors(kind, np.arange(len(ends))[None], z[None], np.zeros((1, 0))), T, NO_MOUNTS)
+    moved = transform_factors(Factors(kind, np.arange(len(ends))[None], z[None], np.zeros((1, 0))), T, NONE, NONE)
     y, far = parts_of(kind, z[None]).y, []
     off = [rng.normal(size=6 if of != "point3" else 3) for of in connects]
     for near in (1e-3, 1e-4):
@@ -126,7 +126,7 @@ def test_what_variables_say_of_each_other_alone_is_distinguished_from_what_they_
         blocks = np.split(H, np.cumsum(widths)[:-1], axis=1)
         measured = np.concatenate([*y, *(block.ravel() for block in blocks), np.zeros(rows)])
         group = Factors(kind, np.arange(len(y))[None], measured[None], np.zeros((1, 0)))
-        assert are_relative(group, NO_MOUNTS).tolist() == [relative]
+        assert are_relative(group, NONE, NONE).tolist() == [relative]
 
 
 def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() -> None:
@@ -150,7 +150,7 @@ def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() 
             rows = TANGENT[kind]
             assert pair.kind == f"linear_{2 * rows if prior else rows}_{kind}_{kind}"
             sent = Factors(pair.kind, pair.keys, pair.measured, pair.information)
-            assert are_relative(sent, NO_MOUNTS).tolist() == [not prior]
+            assert are_relative(sent, NONE, NONE).tolist() == [not prior]
 
 
 def draft_pose(kind: str, step: np.ndarray) -> np.ndarray:
@@ -264,7 +264,7 @@ def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
     Lambda = np.kron(3.01 * np.eye(3) - np.ones((3, 3)), np.diag([100.0, 100.0, 400.0]))
     H = np.split(np.linalg.cholesky(Lambda).T, 3, axis=1)
     sent = Draft().linear(["x0", "x1", "x2"], [np.zeros(3)] * 3, H, np.zeros(9), sigmas=[1.0] * 9).batch().factors
-    assert not are_relative(sent[0], NO_MOUNTS).any()
+    assert not are_relative(sent[0], NONE, NONE).any()
     batch = there().batch
     other = MapGraph(
         9, 4, Batch((*batch.variables, Variables("se2", keys[2:], np.zeros((1, 3)))), (*batch.factors, *sent))

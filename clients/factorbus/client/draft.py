@@ -6,12 +6,11 @@ Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.0
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias, TypedDict, TypeVar, Unpack, cast
+from typing import TypeVar, Unpack, cast
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import all_finite, as_numbers, checked_flag, checked_keywords, of_type
+from factorbus.client.arguments import all_finite, as_numbers, checked_flag, checked_keywords, checked_row, of_type
 from factorbus.client.certainty import (
     Certainty,
     FeatureCertainty,
@@ -22,25 +21,18 @@ from factorbus.client.certainty import (
     transform_certainty,
     triangle_of,
 )
+from factorbus.client.draft_columns import FactorRows, Held, VariableRows, batch_of_columns
+from factorbus.client.imu import STANDARD_GRAVITY, ImuNoise, imu_factor, known_by_noise, moment, turned_samples
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.client.linear import linear_factor
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
-from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.problems import BadShape, UnknownKind
-from factorbus.proto.stamps import NO_STAMP
+from factorbus.proto.messages import Batch, Factors
+from factorbus.proto.problems import BadOption, BadShape, UnknownKind
 from factorbus.proto.symbols import format_symbol
 
 _Kind = TypeVar("_Kind")
-_Row: TypeAlias = NDArray[np.float64]
-
-
-class Held(TypedDict, total=False):
-    """What may be said of a variable besides its value: see `Draft`."""
-
-    fixed: bool
-    stamp: int | None
 
 
 class Draft:
@@ -56,8 +48,8 @@ class Draft:
     """
 
     def __init__(self) -> None:
-        self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[_Row], list[int]]] = {}
-        self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
+        self._variables: VariableRows = {}
+        self._factors: FactorRows = {}
         self._linear: list[Factors] = []
 
     def se2(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
@@ -80,12 +72,18 @@ class Draft:
         """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
         return self.variable("idp", key, value, **held)
 
-    def vector(self, key: Key, value: ArrayLike, **held: Unpack[Held]) -> Draft:
+    def vector(
+        self, key: Key, value: ArrayLike | None = None, *, size: int | None = None, **held: Unpack[Held]
+    ) -> Draft:
         """One to nine numbers of any units, which no frame moves: a velocity, a bias, a scale, an offset of clocks.
 
-        What is known of it is said by `linear`; no factor gives it a value.
+        What is known of it is said by `linear`.  It comes with a value, or with `size`, how many numbers, where it gets
+        one as a velocity or bias at the end of an inertial factor (`imu`).
         """
-        size = all_finite("vector", as_numbers("vector", value)).size
+        if value is not None:
+            size = all_finite("vector", as_numbers("vector", value)).size
+        elif size is None:
+            raise BadOption("vector", "neither a value nor a size", "one of the two")
         return self.variable(f"vector{size}", key, value, **held)
 
     def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
@@ -126,7 +124,9 @@ class Draft:
         """
         if mount is not None and not isinstance(mount, str | int):
             where = self._joins(first, second, "between_se2")
-            measured, A = transform_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
+            measured, A = transform_se2(
+                checked_row(f"{where}: measured", measured, 3), checked_row(f"{where}: mount", mount, 3)
+            )
             certainty = transform_certainty(where, 3, certainty, A, "between_se2")
             mount = None
         return self._at_mount("between_se2", (first, second), mount, measured, certainty)
@@ -151,7 +151,7 @@ class Draft:
         if mount is not None and not isinstance(mount, str | int):
             where = self._joins(first, second, "between_se3")
             measured, A = transform_se3(
-                where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7)
+                where, checked_row(f"{where}: measured", measured, 7), checked_row(f"{where}: mount", mount, 7)
             )
             certainty = transform_certainty(where, 6, certainty, A, "between_se3")
             mount = None
@@ -176,7 +176,10 @@ class Draft:
     ) -> Draft:
         """Where an antenna is in the map: x y (metres); lever: where it is on the robot."""
         return self.factor(
-            "position_se2", (key,), [*_row("measured", measured, 2), *_row("lever", lever, 2)], **certainty
+            "position_se2",
+            (key,),
+            [*checked_row("measured", measured, 2), *checked_row("lever", lever, 2)],
+            **certainty,
         )
 
     def position_se3(
@@ -184,7 +187,10 @@ class Draft:
     ) -> Draft:
         """Where an antenna is in the map: x y z (metres); lever: where it is on the robot."""
         return self.factor(
-            "position_se3", (key,), [*_row("measured", measured, 3), *_row("lever", lever, 3)], **certainty
+            "position_se3",
+            (key,),
+            [*checked_row("measured", measured, 3), *checked_row("lever", lever, 3)],
+            **certainty,
         )
 
     def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> Draft:
@@ -195,7 +201,7 @@ class Draft:
         self, key: Key, seen: ArrayLike, *, direction: ArrayLike = (0.0, 0.0, -1.0), **certainty: Unpack[Certainty]
     ) -> Draft:
         """A direction of the map (down, unless said otherwise) as the robot sees it: vectors of any length."""
-        both = [*_row("seen", seen, 3), *_row("direction", direction, 3)]
+        both = [*checked_row("seen", seen, 3), *checked_row("direction", direction, 3)]
         return self.factor("attitude_se3", (key,), both, **certainty)
 
     def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[SensorCertainty]) -> Draft:
@@ -220,7 +226,33 @@ class Draft:
 
     def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """Where a point3 is to be seen from the pose: a vector of any length in its frame; sigmas: nearly radians."""
-        return self._seen("bearing_se3", (pose, point), _row("direction", direction, 3), certainty)
+        return self._seen("bearing_se3", (pose, point), checked_row("direction", direction, 3), certainty)
+
+    def imu(
+        self,
+        first: Sequence[Key],
+        second: Sequence[Key],
+        samples: ArrayLike,
+        *,
+        noise: ImuNoise,
+        gravity: ArrayLike = (0.0, 0.0, -STANDARD_GRAVITY),
+        bias: ArrayLike = (0.0,) * 6,
+        attitude: ArrayLike | None = None,
+        **certainty: Unpack[Certainty],
+    ) -> Draft:
+        """What an IMU measured between two moments, each a pose (se3), a velocity in the map (vector3) and a bias
+        (vector6): ("x0", "v0", "b0"), ("x1", "v1", "b1").  Those of the second without a value get it from this.
+
+        samples (n, 7), n up to 2000: duration (s), gyroscopes (rad/s), accelerometers (m/s²), as it measured them, from
+        pose to pose (`cut_samples`); the service integrates them at every linearization.
+        gravity: in the map, m/s².  bias: where the noise of the samples is propagated, the best guess of it.
+        attitude: how the IMU is turned on the robot, qx qy qz qw; a bias is along the robot's axes then.
+        How certain it is follows from the noise: sigmas= or information= are beside that, of a residual of sigma 1.
+        """
+        keys = key_numbers([*moment("imu: first", first), *moment("imu: second", second)]).tolist()
+        where = " ".join(["imu", *map(format_symbol, keys)])
+        kind, row = imu_factor(where, turned_samples(where, samples, attitude), noise, gravity, bias)
+        return self.factor(kind, keys, row, **known_by_noise(certainty))
 
     def linear(
         self,
@@ -262,7 +294,7 @@ class Draft:
         sigma_rho=, of that guess, 1/metre; sigma_pixel=, sigma_anchor= and loss= where the usual ones do not do
         (`factorbus.client.certainty.FeatureCertainty`).
         """
-        measured = [*_row("pixel", pixel, 2), rho, *_lens(camera)]
+        measured = [*checked_row("pixel", pixel, 2), rho, *_lens(camera)]
         sigmas = feature_sigmas(self._joins(pose, feature, "idp_first"), certainty)
         return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=certainty.get("loss"))
 
@@ -270,7 +302,7 @@ class Draft:
         self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
     ) -> Draft:
         """An idp seen again by the pose's camera: u v (pixels)."""
-        return self.factor("idp_seen", (pose, feature), [*_row("pixel", pixel, 2), *_lens(camera)], **certainty)
+        return self.factor("idp_seen", (pose, feature), [*checked_row("pixel", pixel, 2), *_lens(camera)], **certainty)
 
     def point_seen(
         self,
@@ -281,7 +313,7 @@ class Draft:
         **certainty: Unpack[SensorCertainty],
     ) -> Draft:
         """A point3 seen by the pose's camera: u v (pixels)."""
-        measured = [*_row("pixel", pixel, 2), *_lens(camera)]
+        measured = [*checked_row("pixel", pixel, 2), *_lens(camera)]
         return self._seen("point_seen", (pose, point), measured, certainty)
 
     def variable(
@@ -295,7 +327,7 @@ class Draft:
         size = _known(VARIABLE_KINDS, kind).size
         number = key_number(key)
         where = f"{kind} {format_symbol(number)}"
-        row = None if value is None else _row(where, value, size)
+        row = None if value is None else checked_row(where, value, size)
         checked_keywords(where, held, tuple(Held.__annotations__))
         fixed = checked_flag(f"{where}: fixed", held.get("fixed", False))
         keys, rows, stamps = self._variables.setdefault((kind, row is not None, fixed), ([], [], []))
@@ -319,7 +351,7 @@ class Draft:
         where = " ".join([kind, *map(format_symbol, numbers)])
         if len(numbers) != len(of.connects):
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
-        row = _row(f"{where}: measured", measured, of.size)
+        row = checked_row(f"{where}: measured", measured, of.size)
         name, scale = loss_of(where, certainty.get("loss"))
         triangle = triangle_of(where, of.dim, certainty, kind)
         all_keys, all_measured, all_triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
@@ -349,32 +381,7 @@ class Draft:
 
     def batch(self) -> Batch:
         """What has been drafted so far, as columns."""
-        return Batch(
-            tuple(
-                Variables(
-                    kind,
-                    np.array(keys, np.int64),
-                    np.array(rows) if valued else None,
-                    fixed,
-                    np.array(stamps, np.int64) if any(stamp != NO_STAMP for stamp in stamps) else None,
-                )
-                for (kind, valued, fixed), (keys, rows, stamps) in self._variables.items()
-            ),
-            (
-                *(
-                    Factors(
-                        kind,
-                        np.array(keys, np.int64),
-                        np.array(measured),
-                        np.array(information),
-                        loss,
-                        np.array(scales) if loss else None,
-                    )
-                    for (kind, loss), (keys, measured, information, scales) in self._factors.items()
-                ),
-                *self._linear,
-            ),
-        )
+        return batch_of_columns(self._variables, self._factors, self._linear)
 
 
 def batch_of(what: str, given: Batch | Draft) -> Batch:
@@ -390,10 +397,3 @@ def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
     if not isinstance(kind, str) or kind not in kinds:
         raise UnknownKind("draft", str(kind), tuple(kinds))
     return kinds[kind]
-
-
-def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
-    row = as_numbers(where, numbers, f"({size},) numbers")
-    if row.shape != (size,):
-        raise BadShape(where, f"shape {row.shape}", f"({size},)")
-    return all_finite(where, row)

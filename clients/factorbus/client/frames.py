@@ -6,7 +6,7 @@ space.
 
 import numpy as np
 
-from factorbus.proto.arrays import F64
+from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import VARIABLE_KINDS
 
 # Numbers of a pose, by the space that a kind of variable is in.
@@ -64,6 +64,14 @@ def moved_values(kind: str, values: F64, T_a_b: F64) -> F64:
     rays = np.stack([np.cos(phi) * np.sin(theta), -np.sin(phi), np.cos(phi) * np.cos(theta)], axis=1)
     x, y, z = (rays @ rotation_of(T_a_b).T).T
     return np.column_stack([points, np.arctan2(x, z), np.arctan2(-y, np.hypot(x, z)), values[:, 5]])
+
+
+def turned_values(kind: str, keys: I64, values: F64, T_a_b: F64, axes: I64) -> F64:
+    """As `moved_values`, where `axes` are keys of vectors along the axes of b."""
+    moved, along = moved_values(kind, values, T_a_b), np.isin(keys, axes)
+    if not along.any():
+        return moved
+    return np.where(along[:, None], values @ rotation_of(T_a_b).T, moved)
 
 
 def _wrapped(angles: F64) -> F64:

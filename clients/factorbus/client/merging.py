@@ -22,7 +22,7 @@ from factorbus.client.frames import (
     compose,
     difference,
     inverse,
-    moved_values,
+    turned_values,
 )
 from factorbus.client.mounts import split_mounts
 from factorbus.client.transform_factors import transform_factors
@@ -30,7 +30,7 @@ from factorbus.client.transform_linear import are_relative
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, MapGraph, Variables
-from factorbus.proto.mounts import mounts_of, pick_factors
+from factorbus.proto.mounts import axes_of, mounts_of, pick_factors
 from factorbus.proto.problems import Problem
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
 
@@ -127,11 +127,11 @@ def fit_into(
     given = Batch() if anchors is None else batch_of("anchors", anchors)
     size = _size_of(other.batch)
     renamed = _renamed(other.batch, named)
-    mounts = mounts_of(renamed)
+    mounts, axes = mounts_of(renamed), axes_of(renamed)
     of_robots, renamed = split_mounts(renamed)
     _check_keys(here, _together(of_robots, renamed))
     _check_ends(given, here, _together(of_robots, renamed))
-    kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute, mounts)
+    kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute, mounts, axes)
     if absolute == "keep":
         T = np.array([0.0] * size if size == 3 else [0.0] * 6 + [1.0])
         return Fitted(_together(of_robots, _together(kept, given)), T, {}, given.factor_count)
@@ -139,8 +139,8 @@ def fit_into(
     if not given.factor_count:
         given = _tie(here, renamed, T, sigmas).batch()
     moved = Batch(
-        tuple(g._replace(values=moved_values(g.kind, _values(g), T)) for g in kept.variables),
-        tuple(transform_factors(g, T, mounts) for g in kept.factors),
+        tuple(g._replace(values=turned_values(g.kind, g.keys, _values(g), T, axes)) for g in kept.variables),
+        tuple(transform_factors(g, T, mounts, axes) for g in kept.factors),
     )
     return Fitted(_together(of_robots, _together(moved, given)), T, left_out, given.factor_count)
 
@@ -210,7 +210,7 @@ def _check_ends(anchors: Batch, here: Estimate, renamed: Batch) -> None:
         raise NoAnchor(f"the anchors name {_names(missing)}, which neither this map has nor the other as renamed")
 
 
-def _relative(batch: Batch, absolute: str, mounts: I64) -> tuple[Batch, dict[str, int]]:
+def _relative(batch: Batch, absolute: str, mounts: I64, axes: I64) -> tuple[Batch, dict[str, int]]:
     """Without what is said of the map's own frame, and how many of each kind that were.  Raises AbsoluteFactors."""
     held: dict[str, int] = {}
     fixed = sum(group.keys.size for group in batch.variables if group.fixed)
@@ -218,7 +218,7 @@ def _relative(batch: Batch, absolute: str, mounts: I64) -> tuple[Batch, dict[str
         held["fixed"] = fixed
     factors = []
     for group in batch.factors:
-        stays = are_relative(group, mounts) if FACTOR_KINDS[group.kind].is_linear else _stays(group)
+        stays = are_relative(group, mounts, axes) if FACTOR_KINDS[group.kind].is_linear else _stays(group)
         if not stays.all():
             held[group.kind] = held.get(group.kind, 0) + int((~stays).sum())
         if stays.any():

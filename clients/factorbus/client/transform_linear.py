@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.client.frames import moved_values, rotation_of
+from factorbus.client.frames import rotation_of, turned_values
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.linear import parts_of
@@ -12,32 +12,35 @@ from factorbus.proto.messages import Factors
 _ROUNDING = 1e-6
 
 
-def are_relative(group: Factors, mounts: I64) -> np.ndarray:
+def are_relative(group: Factors, mounts: I64, axes: I64) -> np.ndarray:
     """Of each of the linear factors of a kind, whether it says nothing of where its variables are together.
 
-    With x_n ⊟ y_n after a small motion ξ of the whole frame being G_n ξ, it says nothing if Σ H_n G_n = 0.
-    mounts: keys of what is on a robot, and does not move with the frame.
+    With x_n ⊟ y_n after a small motion ξ of the whole frame being G_n ξ, it says nothing if Σ H_n G_n = 0, nor if it is
+    on velocities alone, which are as certain in any frame.
+    mounts: keys of what is on a robot, and does not move with the frame.  axes: of vectors that turn with it.
     """
     kinds, y, H, _ = parts_of(group.kind, group.measured)
-    said = np.zeros(len(group.keys), bool)
-    stay = np.array([VARIABLE_KINDS[kind].is_vector for kind in kinds])
-    for n, on_robots in enumerate(np.isin(group.keys, mounts) | stay):
-        ends = zip(kinds, y, H, on_robots.tolist(), strict=True)
-        parts = [J[n] @ _carried(kind, at[n]) for kind, at, J, is_mount in ends if not is_mount]
-        said[n] = not parts or np.abs(sum(parts)).max() <= _ROUNDING * max(np.abs(parts).max(), 1e-300)
+    said, along = np.zeros(len(group.keys), bool), np.isin(group.keys, axes)
+    stay = np.array([VARIABLE_KINDS[kind].is_vector for kind in kinds]) | np.isin(group.keys, mounts)
+    for n, (stays, turns) in enumerate(zip(stay & ~along, along, strict=True)):
+        ends = zip(kinds, y, H, stays.tolist(), strict=True)
+        parts = [J[n] @ _carried(kind, at[n]) for kind, at, J, stays_here in ends if not stays_here]
+        said[n] = (stays | turns).all() or np.abs(sum(parts)).max() <= _ROUNDING * max(np.abs(parts).max(), 1e-300)
     return said
 
 
-def transform_linear(group: Factors, T_a_b: F64, mounts: I64) -> Factors:
-    """y moves with x.  Of a pose x ⊟ y is local, and the same; of a point it turns with the frame, and H against it.
+def transform_linear(group: Factors, T_a_b: F64, mounts: I64, axes: I64) -> Factors:
+    """y moves with x.  Of a pose x ⊟ y is local, and the same; of a point it turns with the frame, and H against it, as
+    of a vector along the frame's axes.
 
-    mounts: keys of what is on a robot, whose y stays.
+    mounts: keys of what is on a robot, whose y stays.  axes: keys of such vectors.
     """
-    parts, y = parts_of(group.kind, group.measured), []
-    for kind, values, keys in zip(parts.kinds, parts.y, group.keys.T, strict=True):
-        y.append(np.where(np.isin(keys, mounts)[:, None], values, moved_values(kind, values, T_a_b)))
-    ends = zip(parts.kinds, parts.y, y, parts.H, strict=True)
-    H = [_turned(kind, before, after, J, T_a_b) for kind, before, after, J in ends]
+    parts, y, H = parts_of(group.kind, group.measured), [], []
+    for kind, values, J, keys in zip(parts.kinds, parts.y, parts.H, group.keys.T, strict=True):
+        moved = turned_values(kind, keys, values, T_a_b, axes)
+        y.append(np.where(np.isin(keys, mounts)[:, None], values, moved))
+        turned, along = _turned(kind, values, y[-1], J, T_a_b), np.isin(keys, axes)
+        H.append(np.where(along[:, None, None], J @ rotation_of(T_a_b).T, turned) if along.any() else turned)
     return group._replace(measured=parts._replace(y=y, H=H).measured())
 
 
@@ -57,6 +60,10 @@ def _turned(kind: str, before: F64, after: F64, H: F64, T_a_b: F64) -> F64:
 
 def _carried(kind: str, y: F64) -> F64:
     """G: the increment of a value when the frame that it is in moves by ξ = (translation, rotation)."""
+    if kind == "vector2":  # along the axes of the frame
+        return np.array([[0.0, 0.0, -y[1]], [0.0, 0.0, y[0]]])
+    if kind == "vector3":
+        return np.column_stack([np.zeros((3, 3)), -_cross(y)])
     if kind == "point2":
         return np.array([[1.0, 0.0, -y[1]], [0.0, 1.0, y[0]]])
     if kind == "se2":

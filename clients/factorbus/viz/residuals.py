@@ -11,19 +11,26 @@ from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import parts_of
 from factorbus.proto.messages import Factors, Variables
+from factorbus.viz.inertial import inertial_residual
 
 _WIDEST = 7  # numbers of a pose in space
 
 
 def chi2_of_factors(group: Factors, values: "Values") -> F64:
     """rᵀ Ω r of each factor of `group` (m,); NaN where a variable has no value or the kind is not one of ours."""
-    known = FACTOR_KINDS.get(group.kind)
-    residual = _linear(group.kind) if known is not None and known.is_linear else _RESIDUALS.get(group.kind)
+    residual = _residual_of(group.kind)
     if residual is None or not len(group.keys):
         return np.full(len(group.keys), np.nan)
     r = residual(*(values.rows(column) for column in group.keys.T), group.measured)
     omega = _full(group.information, r.shape[1])
     return np.einsum("mi,mij,mj->m", r, omega, r)
+
+
+def _residual_of(kind: str) -> Callable[..., F64] | None:
+    known = FACTOR_KINDS.get(kind)
+    if known is not None and known.is_linear:
+        return _linear(kind)
+    return inertial_residual if known is not None and known.samples else _RESIDUALS.get(kind)
 
 
 class Values:

@@ -1,4 +1,5 @@
-"""Mounts of sensors in a graph: poses on a robot, which are not in the frame of the map."""
+"""Variables of a graph that are not where poses and points are: mounts of sensors, which are in the frame of a robot,
+and vectors along the axes of the map, such as velocities."""
 
 import numpy as np
 
@@ -11,6 +12,19 @@ def mounts_of(batch: Batch) -> I64:
     """The keys of the mounts: the last variables of the factors whose kind has a mount."""
     known = [(FACTOR_KINDS.get(group.kind), group.keys) for group in batch.factors]
     found = [keys[:, -1] for kind, keys in known if kind is not None and kind.base]
+    return np.unique(np.concatenate([np.empty(0, np.int64), *found]))
+
+
+def axes_of(batch: Batch) -> I64:
+    """The keys of the vectors along the map's axes, which turn with it: the velocities of inertial factors."""
+    known = [(FACTOR_KINDS.get(group.kind), group.keys) for group in batch.factors]
+    found = [
+        keys[:, column]
+        for kind, keys in known
+        if kind is not None
+        for column, role in enumerate(kind.roles)
+        if role == "axes"
+    ]
     return np.unique(np.concatenate([np.empty(0, np.int64), *found]))
 
 
