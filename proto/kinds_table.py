@@ -1,10 +1,13 @@
-"""Write the table of factors in README.md from `factorbus.proto.kinds`.
+"""Write the tables of factors, and of the operations of own kinds, in README.md from the code.
 
 python proto/kinds_table.py        a test compares
 """
 
 from pathlib import Path
 
+from factorbus.proto import inertial
+from factorbus.proto.derived_kinds import LETTERS
+from factorbus.proto.expressions.operations import OPERATIONS, Operation
 from factorbus.proto.kinds import FACTOR_KINDS, LINEAR_NAME, VARIABLE_KINDS, FactorKind
 
 README = Path(__file__).with_name("README.md")
@@ -12,36 +15,59 @@ _HEAD = """\
 | factor | connects | measured z | residual r (its order is the order of the information matrix) |
 |---|---|---|---|
 """
-_LINEAR = (
+_OPERATIONS_HEAD = """\
+| operation | gives |
+|---|---|
+"""
+_FAMILIES = (
     f"| `{LINEAR_NAME}` | any x₁, x₂, … | y of each variable, H of each (rows x its scalars, row by row), b (rows) "
     "| Σ Hₙ (xₙ ⊟ yₙ) + b |\n"
+    f"| `{inertial.NAME}` | se3 a, vector3 vₐ, vector6 βₐ, se3 b, vector3 v_b, vector6 β_b | {inertial.MEASURED} "
+    f"| {inertial.DIFFERENCE} |\n"
 )
 
 
 def main() -> None:
     """Replace the table that is there."""
     text = README.read_text()
-    README.write_text(text.replace(found(text), table()))
+    text = text.replace(found(text), table())
+    README.write_text(text.replace(found(text, _OPERATIONS_HEAD), operations()))
 
 
 def table() -> str:
-    """A row for each kind, and one for linear factors."""
+    """A row for each kind, and one for each family of kinds: linear and inertial factors."""
     rows = [
         f"| `{kind.name}` | {_ends(kind)} | {kind.measured} | {kind.residual} |\n" for kind in FACTOR_KINDS.values()
     ]
-    return _HEAD + "".join(rows) + _LINEAR
+    return _HEAD + "".join(rows) + _FAMILIES
 
 
-def found(text: str) -> str:
-    """The table in the text of the page: up to the next line that is no row."""
-    start = text.index(_HEAD)
+def operations() -> str:
+    """A row for each operation, and for numbers."""
+    rows = [f"| `{each.name}({_arguments(each)})` | {each.means} |\n" for each in OPERATIONS.values()]
+    return _OPERATIONS_HEAD + "".join(rows)
+
+
+def _arguments(operation: Operation) -> str:
+    if operation.arguments < 0:
+        return "a,b,..."
+    return ",".join([*"abc"[: operation.arguments], *(("first", "count") if operation.numbers else ())])
+
+
+def found(text: str, head: str = _HEAD) -> str:
+    """The table with this head in the text of the page: up to the next line that is no row."""
+    start = text.index(head)
     return text[start : text.index("\n\n", start) + 1]
 
 
 def _ends(kind: FactorKind) -> str:
-    poses = [VARIABLE_KINDS[end].is_pose for end in kind.connects]
     if kind.base:
-        letters = ["a", "b" if all(poses) else "l", "m"]
+        base = FACTOR_KINDS[kind.base]
+        further = zip(kind.connects[len(base.connects) :], kind.modifiers, strict=True)
+        return ", ".join([_ends(base), *(f"{end} {LETTERS[modifier]}" for end, modifier in further)])
+    poses = [VARIABLE_KINDS[end].is_pose for end in kind.connects]
+    if kind.roles:
+        letters = ["f", "v"]
     elif len(poses) == 1:
         letters = ["x"]
     elif all(poses):

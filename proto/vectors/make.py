@@ -13,7 +13,7 @@ that lead to them, are made in `kitchen.py`: their numbers are those of a stated
 import json
 import runpy
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import msgpack
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind, linear_kind
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind, imu_kind, linear_kind
 from factorbus.proto.messages import (
     Batch,
     Change,
@@ -67,7 +67,10 @@ def vectors() -> dict[str, bytes]:
         "insert_observations": codec.encode_insert(Insert(5, _observations(), epoch=7)),
         "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
         "insert_mounts": codec.encode_insert(Insert(10, _mounts(), epoch=7)),
+        "insert_calibration": codec.encode_insert(Insert(11, _calibration(), epoch=7)),
+        "insert_inertial": codec.encode_insert(Insert(11, _inertial(), epoch=7)),
         "insert_linear_kinds": codec.encode_insert(Insert(9, _linear_kinds(), epoch=7)),
+        "insert_own_kind": codec.encode_insert(Insert(11, _own_kind(), epoch=7)),
         "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, convert_below=0.1)),
         "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
         "insert_marginalize": codec.encode_insert(
@@ -200,6 +203,13 @@ def _linear_kinds() -> Batch:
     return Batch(tuple(_vectors()), tuple(groups))
 
 
+def _own_kind() -> Batch:
+    """A kind that a client has written itself: its name is its formula."""
+    kind = "near(a:se3,l:point3,bias:vector1,z:1)=subtract(add(norm(act(inverse(a),l)),bias),z)"
+    keys = np.array([[symbol("y", 1), symbol("p", 1), symbol("v", 1)]])
+    return Batch(factors=(Factors(kind, keys, np.array([[2.5]]), np.array([[4.0]])),))
+
+
 def _vectors() -> Iterator[Variables]:
     """One of each size."""
     for n in range(1, 10):
@@ -208,15 +218,56 @@ def _vectors() -> Iterator[Variables]:
 
 def _mounts() -> Batch:
     """What sensors measure whose mount is a variable: the key of the mount is the last of each row."""
+    return _derived(lambda kind: "mount" in kind.modifiers)
+
+
+def _calibration() -> Batch:
+    """Kinds with a bias, a scale, another frame, a lever arm or a clock's offset that is a variable, and velocities."""
+    return _derived(lambda kind: kind.roles != () and "mount" not in kind.modifiers)
+
+
+def _derived(wanted: Callable[[FactorKind], bool]) -> Batch:
+    """A factor of each kind that is wanted; places have numbers from 1 on, what is no place has 0."""
     groups = []
     for name, kind in FACTOR_KINDS.items():
-        if kind.base:
-            first, second = ("x", "l") if kind.connects[0] == "se2" else ("y", "p")
-            second = second if kind.connects[1].startswith("point") else first
-            keys = np.array([[symbol(first, 1), symbol(second, 2), symbol("m" if first == "x" else "n", 0)]])
+        if wanted(kind):
+            keys = [
+                _named(end, role, n, kind.connects[0])
+                for n, (end, role) in enumerate(zip(kind.connects, kind.roles, strict=True))
+            ]
             unit = np.eye(kind.dim)[np.triu_indices(kind.dim)]
-            groups.append(Factors(name, keys, np.array([kind.example]), unit[None]))
+            groups.append(Factors(name, np.array([keys]), np.array([kind.example]), unit[None]))
     return Batch(factors=tuple(groups))
+
+
+def _named(end: str, role: str, n: int, space: str) -> int:
+    """The key of the n-th variable of a factor, by its kind and role."""
+    letters = {"se2": "x", "se3": "y", "point2": "l", "point3": "p"}
+    aside = {"mount": "mn", "frame": "fg"}
+    if role in aside:
+        return symbol(aside[role][space == "se3"], 0)
+    return symbol(letters[end], 1 + n) if end in letters else symbol("v", int(end.removeprefix("vector")))
+
+
+def _inertial() -> Batch:
+    """An IMU's samples between two moments; what is known of the first of them."""
+    before, after = ([symbol(letter, n) for letter in "xvb"] for n in (1, 2))
+    kind, kinds = imu_kind(2), ("se3", "vector3", "vector6")
+    first = [0.0] * 6 + [1.0], [1.5, 0.25, 0.0], [0.0] * 6
+    return Batch(
+        (
+            *(Variables(of, np.array([key]), np.array([x])) for of, key, x in zip(kinds, before, first, strict=True)),
+            *(Variables(of, np.array([key])) for of, key in zip(kinds, after, strict=True)),
+        ),
+        (
+            Factors(
+                kind.name,
+                np.array([[*before, *after]]),
+                np.array([kind.example]),
+                np.eye(kind.dim)[np.triu_indices(kind.dim)][None],
+            ),
+        ),
+    )
 
 
 def _observations() -> Batch:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from naive.dense_derived import is_derived, with_further
+from naive.dense_derived import parts_of as modifiers_of
 from naive.dense_factors import TANGENT, boxminus, boxplus, pose_matrix, pose_vector, residual
 from naive.dense_least_squares import full
 from naive.random_camera_factors import random_camera_factor
@@ -17,6 +19,7 @@ from naive.random_others import LINEAR, random_other
 from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, KeyCollision, NoAnchor
 from factorbus.client.frames import compose, difference, inverse, moved_values
 from factorbus.client.merging import fit_into
+from factorbus.client.roles import Roles
 from factorbus.client.transform_factors import transform_factors
 from factorbus.client.transform_linear import are_relative
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
@@ -29,11 +32,10 @@ from factorbus.solver.changing import with_changes
 
 seeds = st.integers(0, 2**32 - 1)
 ABSOLUTE = ("prior", "position", "heading", "attitude")
-# Mounts are not in the frame of a map: see test_merging_mounts.
-RELATIVE = [n for n, k in FACTOR_KINDS.items() if not (n.startswith(ABSOLUTE) or k.base)]
+RELATIVE = [name for name in FACTOR_KINDS if not name.startswith(ABSOLUTE) or "frame" in name]
 # Of one variable such a factor is absolute.
 JOINING = [name for name in LINEAR if len(FACTOR_KINDS[name].connects) > 1]
-NO_MOUNTS = np.empty(0, np.int64)
+NO_ROLES = Roles()
 SIGMAS = (0.1, 0.1, 0.05)
 
 
@@ -50,6 +52,10 @@ def test_composition_is_that_of_matrices(kind: str, seed: int) -> None:
 
 def random_relative(kind: str, rng: np.random.Generator) -> Any:
     """Values of what a factor of this kind is on, and what is measured."""
+    if is_derived(kind):
+        ends, z = random_relative(modifiers_of(kind)[0], rng)
+        further = [random_value(of, rng) for of in FACTOR_KINDS[kind].connects[len(ends) :]]
+        return [*ends, *further], with_further(kind, z, rng)
     if kind in ("idp_first", "idp_seen", "point_seen"):
         return random_camera_factor(kind, rng)[1:]
     ends = [random_value(of, rng) for of in FACTOR_KINDS[kind].connects]
@@ -71,8 +77,10 @@ def test_a_moved_factor_says_of_moved_values_what_it_said_before(kind: str, seed
     T = random_value("se2" if connects[0].endswith("2") else "se3", rng)
     omega = random_information(FACTOR_KINDS[kind].dim, rng)
     group = Factors(kind, np.arange(len(ends))[None], z[None], omega[None])
-    moved = transform_factors(group, T, NO_MOUNTS)
-    there = [moved_values(of, end[None], T)[0] for of, end in zip(connects, ends, strict=True)]
+    moved = transform_factors(group, T, NO_ROLES)
+    roles = FACTOR_KINDS[kind].roles or [""] * len(ends)
+    ways = zip(connects, ends, roles, strict=True)
+    there = [moved_values(of, end[None], T, role)[0] for of, end, role in ways]
     before, after = residual(kind, ends, z), residual(kind, there, moved.measured[0])
     expected = before @ full(omega) @ before
     if kind in JOINING and "idp" in kind:  # directions turn to first order: see below
@@ -86,7 +94,7 @@ def test_a_moved_factor_of_features_says_so_to_first_order(kind: str, seed: int)
     rng = np.random.default_rng(seed)
     ends, z = random_relative(kind, rng)
     connects, T = FACTOR_KINDS[kind].connects, random_value("se3", rng)
-    moved = transform_factors(Factors(kind, np.arange(len(ends))[None], z[None], np.zeros((1, 0))), T, NO_MOUNTS)
+    moved = transform_factors(Factors(kind, np.arange(len(ends))[None], z[None], np.zeros((1, 0))), T, NO_ROLES)
     y, far = parts_of(kind, z[None]).y, []
     off = [rng.normal(size=6 if of != "point3" else 3) for of in connects]
     for near in (1e-3, 1e-4):
@@ -126,7 +134,7 @@ def test_what_variables_say_of_each_other_alone_is_distinguished_from_what_they_
         blocks = np.split(H, np.cumsum(widths)[:-1], axis=1)
         measured = np.concatenate([*y, *(block.ravel() for block in blocks), np.zeros(rows)])
         group = Factors(kind, np.arange(len(y))[None], measured[None], np.zeros((1, 0)))
-        assert are_relative(group, NO_MOUNTS).tolist() == [relative]
+        assert are_relative(group, NO_ROLES).tolist() == [relative]
 
 
 def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() -> None:
@@ -150,7 +158,7 @@ def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() 
             rows = TANGENT[kind]
             assert pair.kind == f"linear_{2 * rows if prior else rows}_{kind}_{kind}"
             sent = Factors(pair.kind, pair.keys, pair.measured, pair.information)
-            assert are_relative(sent, NO_MOUNTS).tolist() == [not prior]
+            assert are_relative(sent, NO_ROLES).tolist() == [not prior]
 
 
 def draft_pose(kind: str, step: np.ndarray) -> np.ndarray:
@@ -264,7 +272,7 @@ def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
     Lambda = np.kron(3.01 * np.eye(3) - np.ones((3, 3)), np.diag([100.0, 100.0, 400.0]))
     H = np.split(np.linalg.cholesky(Lambda).T, 3, axis=1)
     sent = Draft().linear(["x0", "x1", "x2"], [np.zeros(3)] * 3, H, np.zeros(9), sigmas=[1.0] * 9).batch().factors
-    assert not are_relative(sent[0], NO_MOUNTS).any()
+    assert not are_relative(sent[0], NO_ROLES).any()
     batch = there().batch
     other = MapGraph(
         9, 4, Batch((*batch.variables, Variables("se2", keys[2:], np.zeros((1, 3)))), (*batch.factors, *sent))

@@ -10,7 +10,7 @@ from factorbus.client import Draft
 from factorbus.client.frames import compose
 from factorbus.client.merging import fit_into
 from factorbus.proto.messages import Batch, Change, Estimate, Factors, MapGraph, Variables
-from factorbus.proto.mounts import mounts_of
+from factorbus.proto.roles import mounts_of
 from factorbus.proto.symbols import parse_symbol, symbol
 from factorbus.solver import Options, Solver
 from factorbus.solver.changing import with_changes

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from naive.dense_factors import residual
+from naive.random_derived import calibration_steps
 from naive.random_graphs import random_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
@@ -22,6 +23,12 @@ def sensor_steps(seed: int) -> Iterator[Batch]:
         yield Batch(batch.variables, tuple(group for group in batch.factors if group.kind != "point_seen_mount"))
 
 
+def calibrated_steps(seed: int) -> Iterator[Batch]:
+    """Biases, scales, other frames, lever arms and offsets of clocks, but for what has a lens."""
+    for batch in calibration_steps(seed):
+        yield Batch(batch.variables, tuple(group for group in batch.factors if group.kind != "point_seen_offset"))
+
+
 WORLDS = [
     (random_steps, 1),
     (random_steps, 2),
@@ -29,6 +36,7 @@ WORLDS = [
     (other_steps, 1),
     (other_steps, 2),
     (sensor_steps, 1),
+    (calibrated_steps, 1),
 ]
 
 
@@ -59,7 +67,7 @@ def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(steps
 
 def test_the_graphs_above_have_every_kind_but_observations() -> None:
     kinds = {group.kind for steps, seed in WORLDS for step in steps(seed) for group in step.factors}
-    lenses = {"idp_first", "idp_seen", "point_seen", "point_seen_mount"}  # more than colours need
+    lenses = {"idp_first", "idp_seen", "point_seen", "point_seen_mount", "point_seen_offset"}  # more than colours need
     assert {kind for kind in kinds if not FACTOR_KINDS[kind].is_linear} == set(FACTOR_KINDS.keys()) - lenses
 
 

@@ -229,6 +229,8 @@ EVERY_METHOD = {
     "bearing_range_se2": lambda d, **how: d.bearing_range_se2("x0", "l0", (0.1, 2.0), **how),
     "position_se2": lambda d, **how: d.position_se2("x0", (1, 0), **how),
     "position_se3": lambda d, **how: d.position_se3("x0", (1, 0, 0), **how),
+    "velocity_frame_se2": lambda d, **how: d.velocity_frame_se2("f0", "v0", (1, 0), **how),
+    "velocity_frame_se3": lambda d, **how: d.velocity_frame_se3("f0", "v0", (1, 0, 0), **how),
     "heading_se2": lambda d, **how: d.heading_se2("x0", 0.1, **how),
     "attitude_se3": lambda d, **how: d.attitude_se3("x0", (0, 0, 1), **how),
     "range_se2": lambda d, **how: d.range_se2("x0", "l0", 2.0, **how),
@@ -251,8 +253,9 @@ def test_every_method_that_takes_a_certainty_is_among_them() -> None:
         for name, method in inspect.getmembers(Draft, inspect.isfunction)
         if not name.startswith("_") and any(p.kind is kinds for p in inspect.signature(method).parameters.values())
     }
-    # An inverse-depth feature has a certainty of its own, `FeatureCertainty`; a variable has none (`Held`).
-    assert takes - {"idp_first", "variable", "vector", *VARIABLE_KINDS} == set(EVERY_METHOD)
+    # An inverse-depth feature has a certainty of its own, `FeatureCertainty`; so has a receiver of GNSS, which takes
+    # a covariance: see test_further; of an IMU it follows from the noise: see test_imu.  A variable has none (`Held`).
+    assert takes - {"idp_first", "gnss", "imu", "variable", "vector", *VARIABLE_KINDS} == set(EVERY_METHOD)
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)

@@ -22,7 +22,8 @@ _SHELL = re.compile(r"\s*(?:&&|\|\||[|;>&#(]|2>)")
 
 def typed(text: str) -> Iterator[str]:
     """The commands in lines of a shell, each without what the shell does with it."""
-    for line in text.replace("\\\n", " ").splitlines():
+    formulas = re.sub(r"'\w+\([^'\n]*'", "FORMULA", text)  # what is quoted is no shell's
+    for line in formulas.replace("\\\n", " ").splitlines():
         for part in re.split(r"&&|;|\|", line):
             found = re.match(r"\s*(?:\$ )?(?:sudo |exec )?(?:[A-Z_]+=\S+ )*factorbus (\S.*)", part)
             if found:

@@ -4,33 +4,15 @@ Nothing here shares a formula with them: poses are homogeneous matrices, Jacobia
 """
 
 import numpy as np
-from naive import dense_idp
+from naive import dense_idp, dense_imu
+from naive.dense_derived import derived_residual, is_derived
+from naive.dense_poses import plane_rotation, pose_matrix, pose_vector
 from scipy.spatial.transform import Rotation
 
 from factorbus.proto.camera import Camera
 
 TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3, "idp": 6}
 TANGENT |= {f"vector{n}": n for n in range(1, 10)}
-
-
-def pose_matrix(x: np.ndarray) -> np.ndarray:
-    """Homogeneous matrix of an SE2 (3 numbers) or SE3 (7 numbers) pose."""
-    n = 2 if len(x) == 3 else 3
-    T = np.eye(n + 1)
-    T[:n, n] = x[:n]
-    T[:n, :n] = plane_rotation(x[2]) if n == 2 else Rotation.from_quat(x[3:]).as_matrix()
-    return T
-
-
-def plane_rotation(theta: float) -> np.ndarray:
-    return np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-
-
-def pose_vector(T: np.ndarray) -> np.ndarray:
-    """The inverse of `pose_matrix`; the quaternion has qw >= 0."""
-    if len(T) == 3:
-        return np.array([T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0])])
-    return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)])
 
 
 def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
@@ -50,12 +32,16 @@ def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
 
 def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     """r of a kind of factor at the values of its variables.  Raises KeyError: it has no twin yet."""
-    if kind.endswith("_mount"):
-        return residual(kind.removesuffix("_mount"), sensors(ends), z)
+    if is_derived(kind):
+        return derived_residual(residual, kind, ends, z)
+    if kind.startswith("velocity_frame"):
+        return pose_matrix(ends[0])[:-1, :-1] @ ends[1] - z
     if kind in ("idp_first", "idp_seen", "point_seen"):
         return _observation(kind, *ends, z)
     if kind.startswith("linear"):
         return _linear(kind, ends, z)
+    if kind.startswith("imu"):
+        return dense_imu.residual(ends, z)
     if kind.startswith(("position", "heading", "attitude")):
         return _absolute(kind, ends[0], z)
     if kind.startswith("prior_point"):
@@ -70,12 +56,6 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     if kind.startswith(("landmark", "range", "bearing")):
         return _of_a_point(kind, *ends, z)
     raise KeyError(f"the kind {kind!r} has no dense twin; write its residual here")
-
-
-def sensors(ends: list[np.ndarray]) -> list[np.ndarray]:
-    """Of poses, or a pose and a point, and a mount last: the poses of the sensor there, or one and the point."""
-    *others, mount = ends
-    return [pose_vector(pose_matrix(end) @ pose_matrix(mount)) if len(end) == len(mount) else end for end in others]
 
 
 def _of_a_point(kind: str, pose: np.ndarray, point: np.ndarray, z: np.ndarray) -> np.ndarray:

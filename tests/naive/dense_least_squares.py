@@ -1,13 +1,22 @@
 """A factor graph solved with dense matrices: the twin of the solver."""
 
 import numpy as np
+from naive.dense_derived import parts_of
 from naive.dense_factors import TANGENT, boxplus, jacobians, linear_ends, residual
 
 
 class Connects(dict[str, list[str]]):
-    """The kinds of the variables of each kind of factor; a linear one has them in its name."""
+    """The kinds of the variables of each kind of factor; a linear one, or one with further variables, by its name; the
+    same of all inertial ones."""
 
     def __missing__(self, kind: str) -> list[str]:
+        base, modifiers = parts_of(kind)
+        if modifiers:
+            space = self[base][0]
+            of = {"mount": space, "frame": space, "arm": "vector2" if space == "se2" else "vector3"}
+            return [*self[base], *(of.get(modifier, "vector1") for modifier in modifiers)]
+        if kind.startswith("imu_"):
+            return ["se3", "vector3", "vector6"] * 2
         assert kind.startswith("linear_"), kind
         return linear_ends(kind)
 
@@ -33,13 +42,11 @@ CONNECTS = Connects({
     "range_se3": ["se3", "point3"],
     "range_between_se2": ["se2", "se2"],
     "range_between_se3": ["se3", "se3"],
+    "velocity_frame_se2": ["se2", "vector2"],
+    "velocity_frame_se3": ["se3", "vector3"],
     "bearing_se2": ["se2", "point2"],
     "bearing_se3": ["se3", "point3"],
 })  # fmt: skip
-# Of a sensor whose mount is estimated: the mount last.
-_WITH_MOUNT = ("between_se2", "between_se3", "landmark_se2", "landmark_se3", "bearing_range_se2", "bearing_se2")
-_WITH_MOUNT += ("bearing_se3", "range_se2", "range_se3", "point_seen")
-CONNECTS.update({f"{kind}_mount": [*CONNECTS[kind], CONNECTS[kind][0]] for kind in _WITH_MOUNT})
 
 
 class DenseGraph:

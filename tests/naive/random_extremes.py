@@ -1,7 +1,8 @@
 """Inserts with numbers from everywhere in what a map admits: the smallest, the largest, and the same place twice."""
 
 import numpy as np
-from naive.dense_factors import linear_ends
+from naive.dense_derived import is_derived, parts_of, with_further
+from naive.dense_least_squares import CONNECTS
 from naive.random_camera_factors import CAMERA_KINDS, measurement
 from naive.random_cameras import CAMERAS
 from naive.random_others import LINEAR
@@ -11,7 +12,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
 MOST, MOST_INFORMATION = 1e12, 1e24
-SIZES = {"se2": 3, "se3": 7, "point2": 2, "point3": 3, "idp": 6, "vector1": 1, "vector3": 3, "vector9": 9}
+SIZES = {"se2": 3, "se3": 7, "point2": 2, "point3": 3, "idp": 6, "vector1": 1, "vector2": 2, "vector3": 3, "vector9": 9}
 LOSSES = ("", "", "", "huber", "cauchy", "geman-mcclure", "tukey", "dcs")
 LETTERS = {
     "se2": "x",
@@ -20,6 +21,7 @@ LETTERS = {
     "point3": "p",
     "idp": "f",
     "vector1": "s",
+    "vector2": "a",
     "vector3": "v",
     "vector9": "b",
 }
@@ -72,7 +74,8 @@ def information(dim: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def measured(kind: str, rng: np.random.Generator) -> np.ndarray:
-    kind = kind.removesuffix("_mount")
+    if is_derived(kind):
+        return with_further(kind, measured(parts_of(kind)[0], rng), rng)
     if kind in CAMERA_KINDS:
         z = measurement(kind, CAMERAS["radtan"], np.zeros(2), number(rng) if kind == "idp_first" else 0.0)
         z[:2] = rng.uniform(0, 500, 2) if rng.random() < 0.7 else numbers(2, rng)
@@ -90,11 +93,8 @@ def measured(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 def connects(kind: str) -> list[str]:
     """The kinds of variables that a kind of factor is on."""
-    if kind.endswith("_mount"):
-        ends = connects(kind.removesuffix("_mount"))
-        return [*ends, ends[0]]
-    if kind.startswith("linear"):
-        return linear_ends(kind)
+    if is_derived(kind) or kind.startswith(("linear", "velocity")):
+        return CONNECTS[kind]
     if kind.startswith("prior_"):
         return [kind.removeprefix("prior_")]
     if kind.startswith(("position", "heading", "attitude")):

@@ -3,26 +3,18 @@
 from collections.abc import Iterator
 
 import numpy as np
-from naive.dense_factors import boxplus, pose_matrix, sensors
-from naive.random_graphs import factor, measured, random_information
-from naive.random_others import random_other
+from naive.dense_factors import boxplus, pose_matrix
+from naive.random_derived import random_derived
+from naive.random_graphs import factor, random_information
 
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-MOUNTED = tuple(name for name, kind in FACTOR_KINDS.items() if kind.base)
+MOUNTED = tuple(name for name, kind in FACTOR_KINDS.items() if "mount" in kind.modifiers)
 PLANE_MOUNT, SPACE_MOUNT, CAMERA_MOUNT = (symbol(letter, 0) for letter in "mnk")
 _PIXEL = 0.01
 _NO_TURN = np.array([0, 0, 0, 0, 0, 0, 1.0])
-
-
-def random_mounted(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:
-    """What a sensor of such a kind would measure at these values, with noise."""
-    of, seen = FACTOR_KINDS[kind].base, sensors(ends)
-    if of.startswith(("range", "bearing_se")):
-        return random_other(of, seen, noise, rng)
-    return measured(of, seen, noise, rng)
 
 
 def true_mounts() -> dict[int, tuple[str, np.ndarray]]:
@@ -49,7 +41,7 @@ def mount_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
         return Variables(kind, np.array([key]), value), Factors(f"prior_{kind}", np.array([[key]]), value, upper)
 
     def made(kind: str, *keys: int) -> Factors:
-        z = random_mounted(kind, [truth[key] for key in keys], noise, rng)
+        z = random_derived(kind, [truth[key] for key in keys], noise, rng)
         information = random_information(FACTOR_KINDS[kind].dim, rng)
         if kind == "point_seen_mount":
             information *= _PIXEL**2

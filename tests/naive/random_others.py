@@ -10,7 +10,7 @@ from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-_BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se")
+_BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se", "velocity")
 # Of one variable, of two, and of more, with fewer rows than they have scalars, as many, and one more.
 LINEAR = (
     *("linear_3_se2", "linear_6_se3", "linear_2_point2", "linear_3_point3", "linear_6_idp", "linear_1_se3"),
@@ -31,6 +31,8 @@ def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random
         return _random_linear(kind, ends, noise, rng)
     T = pose_matrix(ends[0])
     n = len(T) - 1
+    if kind.startswith("velocity"):
+        return T[:n, :n] @ ends[1] + noise * rng.normal(size=n)
     if kind.startswith("position"):
         lever = rng.normal(0, 0.5, n)
         return np.concatenate([(T @ np.append(lever, 1.0))[:n] + noise * rng.normal(size=n), lever])

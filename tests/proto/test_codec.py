@@ -116,10 +116,11 @@ def test_every_kind_has_a_golden_message() -> None:
     batches = [codec.decode_insert(data).batch for name, data in GOLDEN.items() if name.startswith("insert")]
     assert {group.kind for batch in batches for group in batch.variables} == set(VARIABLE_KINDS)
     kinds = {group.kind for batch in batches for group in batch.factors}
-    linear = [FACTOR_KINDS[kind] for kind in kinds - set(FACTOR_KINDS.keys())]
-    assert kinds - {kind.name for kind in linear} == set(FACTOR_KINDS.keys())
-    assert all(kind.is_linear for kind in linear)
-    assert {len(kind.connects) for kind in linear} == {1, 2, 3, 4}
+    families = [FACTOR_KINDS[kind] for kind in kinds - set(FACTOR_KINDS.keys())]
+    assert kinds - {kind.name for kind in families} == set(FACTOR_KINDS.keys())
+    assert all(kind.is_linear or kind.own or kind.samples for kind in families)
+    assert [kind.name for kind in families if kind.samples] == ["imu_2"]
+    assert {len(kind.connects) for kind in families if kind.is_linear} == {1, 2, 3, 4}
 
 
 def from_description(content: Any) -> Any:

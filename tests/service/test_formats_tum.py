@@ -191,6 +191,16 @@ def test_seconds_are_exact(stamp: int) -> None:
     assert len(time.split(".")[1]) == 9
 
 
+def test_the_pose_of_the_map_in_another_frame_is_no_robot() -> None:
+    frame = Variables("se2", np.array([symbol("f", 0)]), np.array([[10.0, 0.2, 0.3]]))
+    fix = Factors(
+        "position_se2_frame", np.array([[symbol("x", 0), symbol("f", 0)]]), np.array([[1.0, 0, 0, 0]]),
+        np.array([[1.0, 0, 1]]),
+    )  # fmt: skip
+    rows = tum_text(Batch((poses(None), frame), (fix,))).splitlines()
+    assert [row.split()[0] for row in rows] == ["0", "1", "2"]
+
+
 def test_a_mount_is_no_robot() -> None:
     """It is a pose on the robot: no trajectory of its own, and so no choice of a robot where there is one."""
     mount = Variables("se2", np.array([symbol("m", 0)]), np.array([[0.1, 0.2, 0.3]]))

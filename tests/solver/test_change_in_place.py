@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from naive.dense_least_squares import DenseGraph
 from naive.estimates import apart, values
+from naive.random_derived import calibration_steps
 from naive.random_graphs import camera_steps, random_steps
+from naive.random_imu import imu_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
 from naive.solver_parts import graph_in, row_count
@@ -33,6 +35,8 @@ WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "others": lambda seed: other_steps(seed),
     "mounts": lambda seed: mount_steps(seed),
     "robust mounts": lambda seed: mount_steps(seed, loss="dcs"),
+    "calibration": lambda seed: calibration_steps(seed, 6),
+    "inertial": lambda seed: imu_steps(seed, loss="huber"),
 }
 
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from naive.dense_least_squares import DenseGraph, distance
 from naive.estimates import apart, values
+from naive.random_derived import calibration_steps
 from naive.random_graphs import camera_steps, random_steps
+from naive.random_imu import imu_steps
 from naive.random_mounts import mount_steps
 from naive.solver_parts import graph_in
 
@@ -73,8 +75,8 @@ def test_the_wire_and_the_solver_know_the_same_changes() -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     "steps",
-    [random_steps, lambda seed: camera_steps(seed, loss="huber"), mount_steps],
-    ids=["robots", "camera", "mounts"],
+    [random_steps, lambda seed: camera_steps(seed, loss="huber"), mount_steps, calibration_steps, imu_steps],
+    ids=["robots", "camera", "mounts", "calibration", "inertial"],
 )
 @pytest.mark.parametrize("seed", range(3))
 def test_an_insert_undone_leaves_the_estimate_that_would_have_been_without(

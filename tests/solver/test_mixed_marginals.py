@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive.dense_factors import pose_matrix, pose_vector
 from naive.dense_least_squares import distance
+from naive.random_derived import calibration_steps
 from naive.random_graphs import camera_steps, random_steps
+from naive.random_imu import imu_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
 from naive.solver_parts import graph_in, joined_by
@@ -29,6 +31,8 @@ WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "cameras": lambda seed: camera_steps(seed, 8, noise=0.003),
     "others": lambda seed: other_steps(seed, 6, noise=0.01),
     "mounts": lambda seed: mount_steps(seed, 5, noise=0.01),
+    "calibration": lambda seed: calibration_steps(seed, 4, noise=0.01),
+    "inertial": lambda seed: imu_steps(seed, 6),
 }
 seeds = st.integers(0, 2**32 - 1)
 

@@ -245,6 +245,8 @@ def test_every_code_is_in_the_table() -> None:
         "too_connected",
         "bad_order",
         "bad_direction",
+        "bad_samples",
+        "kind_taken",
         "named_twice",
         "too_large",
     }  # changes, other kinds

@@ -72,6 +72,10 @@ def test_in_place_and_by_a_worker_it_is_told(endpoint: str, impatient: str, spaw
         worker = spawned(IMPATIENT, "factorbus.workers", "--connect", impatient, "--name", "w")
         worker.ready()
         helped = joined.chi2(batch=True)
+        for _ in range(100):  # the service hears of a worker a moment after it is ready
+            if helped.worker == "w":
+                break
+            helped = joined.chi2(batch=True)
         assert (helped.worker, helped.batch, helped.batch_converged) == ("w", early.batch, False)
 
 

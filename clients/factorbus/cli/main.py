@@ -41,6 +41,7 @@ COMMANDS = {
     "access": ("access", "Write who may do what as a Zenoh configuration: TLS, users, access control."),
     "stats": ("stats", "What services count and time, asked over the bus."),
     "doctor": ("doctor", "Look for what is wrong on this machine, and say how to mend it."),
+    "kinds": ("kinds", "The kinds of factors; what a formula of your own means, and whether it is right."),
     "explain": ("explain", "What an error code means, and what to do."),
     "bench": ("bench", "Measure, beside what it is held against."),
     "version": ("version", "The version, and those of the libraries."),

@@ -12,6 +12,7 @@ from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features, Growing
 from factorbus.client.filter_state import Factored, FilterState
+from factorbus.client.imu import ImuNoise, Standstill, cut_samples, initial_from_standstill
 from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror
@@ -32,6 +33,7 @@ __all__ = [
     "Features",
     "FilterState",
     "Growing",
+    "ImuNoise",
     "KeyCollision",
     "Map",
     "MapRow",
@@ -44,6 +46,9 @@ __all__ = [
     "Problem",
     "Refused",
     "Snapshot",
+    "Standstill",
     "Unavailable",
     "connect",
+    "cut_samples",
+    "initial_from_standstill",
 ]

@@ -55,6 +55,14 @@ def all_finite(what: str, numbers: F64) -> F64:
     return numbers
 
 
+def checked_row(what: str, numbers: Any, size: int) -> F64:
+    """`numbers` as so many floats, all finite.  Raises BadShape, NotFiniteNumbers."""
+    row = as_numbers(what, numbers, f"({size},) numbers")
+    if row.shape != (size,):
+        raise BadShape(what, f"shape {row.shape}", f"({size},)")
+    return all_finite(what, row)
+
+
 def checked_probability(what: str, given: Any) -> float:
     """Between 0 and 1, neither of the two.  Raises BadOption."""
     number = math.nan if isinstance(given, (bool, np.bool_)) or not isinstance(given, Real) else float(given)

@@ -59,15 +59,6 @@ class Certainty(TypedDict, total=False):
     loss: tuple[str, float] | str | None
 
 
-class SensorCertainty(Certainty, total=False):
-    """The same of what a sensor measures that is not in the robot's middle.
-
-    mount: the key of a pose in the robot's frame, where the sensor is on it: a variable, to be found out or fixed.
-    """
-
-    mount: str | int | None
-
-
 class FeatureCertainty(TypedDict, total=False):
     """How certain the first observation of an inverse-depth feature is.
 
@@ -109,6 +100,19 @@ def transform_certainty(where: str, dim: int, certainty: Certainty, A: F64, kind
     """The certainty of r' where this is that of r = A r', both of a factor of `kind`."""
     W = full(triangle_of(where, dim, certainty, kind), dim)
     return {"information": (A.T @ W @ A)[np.triu_indices(dim)], "loss": certainty.get("loss")}
+
+
+def inverted(where: str, covariance: ArrayLike, certainty: Mapping[str, object]) -> Certainty:
+    """The information that a covariance is the inverse of.  Raises BadInformation, BadShape."""
+    if certainty.get("sigmas") is not None or certainty.get("information") is not None:
+        raise BadInformation(where, "a covariance, and sigmas or information", "one of the three: how certain it is")
+    matrix = as_numbers(f"{where}: covariance", covariance)
+    if matrix.shape != (3, 3):
+        raise BadShape(f"{where}: covariance", f"shape {matrix.shape}", "(3, 3)")
+    if not (np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix + matrix.T)[0] > 0.0):
+        raise BadInformation(f"{where}: covariance", repr(matrix.tolist())[:80], "a positive definite matrix")
+    information = np.linalg.inv(matrix)
+    return {"information": (information + information.T) / 2.0}
 
 
 def full(triangle: F64, dim: int) -> F64:

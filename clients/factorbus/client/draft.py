@@ -6,41 +6,42 @@ Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.0
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias, TypedDict, TypeVar, Unpack, cast
+from typing import TypeVar, Unpack
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import all_finite, as_numbers, checked_flag, checked_keywords, of_type
+from factorbus.client.arguments import all_finite, as_numbers, checked_flag, checked_keywords, checked_row, of_type
 from factorbus.client.certainty import (
     Certainty,
     FeatureCertainty,
-    SensorCertainty,
-    check_names,
     feature_sigmas,
     loss_of,
-    transform_certainty,
     triangle_of,
 )
+from factorbus.client.draft_columns import DraftColumns, Held
+from factorbus.client.further import (
+    AntennaCertainty,
+    GnssCertainty,
+    Measured,
+    OdometryCertainty,
+    RangeCertainty,
+    SensorCertainty,
+    odometry,
+    positioned,
+    sensed,
+    with_information,
+)
+from factorbus.client.geodetic import enu
+from factorbus.client.imu import STANDARD_GRAVITY, ImuNoise, imu_factor, known_by_noise, moment, turned_samples
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
-from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.client.linear import linear_factor
 from factorbus.proto.camera import Camera
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
-from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.problems import BadShape, UnknownKind
-from factorbus.proto.stamps import NO_STAMP
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind, FactorKinds
+from factorbus.proto.messages import Batch
+from factorbus.proto.problems import BadOption, BadShape, UnknownKind
 from factorbus.proto.symbols import format_symbol
 
 _Kind = TypeVar("_Kind")
-_Row: TypeAlias = NDArray[np.float64]
-
-
-class Held(TypedDict, total=False):
-    """What may be said of a variable besides its value: see `Draft`."""
-
-    fixed: bool
-    stamp: int | None
 
 
 class Draft:
@@ -56,9 +57,7 @@ class Draft:
     """
 
     def __init__(self) -> None:
-        self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[_Row], list[int]]] = {}
-        self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
-        self._linear: list[Factors] = []
+        self._columns = DraftColumns()
 
     def se2(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
         """A pose in the plane: x y (metres), theta (radians)."""
@@ -80,12 +79,18 @@ class Draft:
         """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
         return self.variable("idp", key, value, **held)
 
-    def vector(self, key: Key, value: ArrayLike, **held: Unpack[Held]) -> Draft:
-        """One to nine numbers of any units, which no frame moves: a velocity, a bias, a scale, an offset of clocks.
+    def vector(
+        self, key: Key, value: ArrayLike | None = None, *, size: int | None = None, **held: Unpack[Held]
+    ) -> Draft:
+        """One to nine numbers of any units, which no frame moves: a bias, a scale, an offset of clocks, a velocity.
 
-        What is known of it is said by `linear`; no factor gives it a value.
+        What is known of it is said by `linear`.  It comes with a value, or with `size`, how many numbers, where it gets
+        one as a velocity or bias at the end of an inertial factor (`imu`).
         """
-        size = all_finite("vector", as_numbers("vector", value)).size
+        if value is not None:
+            size = all_finite("vector", as_numbers("vector", value)).size
+        elif size is None:
+            raise BadOption("vector", "neither a value nor a size", "one of the two")
         return self.variable(f"vector{size}", key, value, **held)
 
     def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
@@ -109,53 +114,30 @@ class Draft:
         return self.factor("prior_point3", (key,), measured, **certainty)
 
     def between_se2(
-        self,
-        first: Key,
-        second: Key,
-        measured: ArrayLike,
-        *,
-        mount: Key | ArrayLike | None = None,
-        **certainty: Unpack[Certainty],
+        self, first: Key, second: Key, measured: ArrayLike, **certainty: Unpack[OdometryCertainty]
     ) -> Draft:
         """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures.
 
-        mount: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
+        mount=: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
         off the centre moves sideways when the robot turns.  The certainty is that of the sensor, in its frame, and is
         carried over to first order in the error (`factorbus.client.lever_arm`, MATH §3.7).
         Or the key of an se2 that is estimated: the mount is to be found out (MATH §3.8).
+        scale=: the key of a vector1 that x and y are to be multiplied by, as of wheels of unknown radius (MATH §3.9).
         """
-        if mount is not None and not isinstance(mount, str | int):
-            where = self._joins(first, second, "between_se2")
-            measured, A = transform_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
-            certainty = transform_certainty(where, 3, certainty, A, "between_se2")
-            mount = None
-        return self._at_mount("between_se2", (first, second), mount, measured, certainty)
+        return self._add(odometry("between_se2", (first, second), measured, certainty))
 
     def between_se3(
-        self,
-        first: Key,
-        second: Key,
-        measured: ArrayLike,
-        *,
-        mount: Key | ArrayLike | None = None,
-        **certainty: Unpack[Certainty],
+        self, first: Key, second: Key, measured: ArrayLike, **certainty: Unpack[OdometryCertainty]
     ) -> Draft:
         """The second pose in the first one's frame: x y z (metres), qx qy qz qw.
 
         Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
         g2o: 4/s² for s radians.
 
-        mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; or the key of an
-        se3.  As in `between_se2`.
+        mount=: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; or the key of an
+        se3.  scale=: as in `between_se2`, of x y z.
         """
-        if mount is not None and not isinstance(mount, str | int):
-            where = self._joins(first, second, "between_se3")
-            measured, A = transform_se3(
-                where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7)
-            )
-            certainty = transform_certainty(where, 6, certainty, A, "between_se3")
-            mount = None
-        return self._at_mount("between_se3", (first, second), mount, measured, certainty)
+        return self._add(odometry("between_se3", (first, second), measured, certainty))
 
     def landmark_se2(self, pose: Key, point: Key, measured: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """A point2 in the pose's frame: x y (metres)."""
@@ -171,21 +153,38 @@ class Draft:
         """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
         return self._seen("bearing_range_se2", (pose, point), measured, certainty)
 
-    def position_se2(
-        self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0), **certainty: Unpack[Certainty]
-    ) -> Draft:
-        """Where an antenna is in the map: x y (metres); lever: where it is on the robot."""
-        return self.factor(
-            "position_se2", (key,), [*_row("measured", measured, 2), *_row("lever", lever, 2)], **certainty
-        )
+    def position_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[AntennaCertainty]) -> Draft:
+        """Where an antenna is in the map, or in another frame: x y (metres).
 
-    def position_se3(
-        self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0, 0.0), **certainty: Unpack[Certainty]
-    ) -> Draft:
-        """Where an antenna is in the map: x y z (metres); lever: where it is on the robot."""
-        return self.factor(
-            "position_se3", (key,), [*_row("measured", measured, 3), *_row("lever", lever, 3)], **certainty
-        )
+        lever=: where it is on the robot, x y, or the key of a vector2; frame=: the key of the se2 that is the map's
+        pose in the frame that this is measured in; offset= and twist=, of its clock (MATH §3.9).
+        """
+        return self._add(positioned("position_se2", key, measured, certainty))
+
+    def position_se3(self, key: Key, measured: ArrayLike, **certainty: Unpack[AntennaCertainty]) -> Draft:
+        """Where an antenna is in the map, or in another frame: x y z (metres).  As `position_se2`."""
+        return self._add(positioned("position_se3", key, measured, certainty))
+
+    def gnss(
+        self, key: Key, latitude: float, longitude: float, height: float, *, origin: ArrayLike,
+        **certainty: Unpack[GnssCertainty],
+    ) -> Draft:  # fmt: skip
+        """Where an antenna is on the Earth: degrees, and metres above the ellipsoid of WGS 84.
+
+        A `position_se3`, east north up (metres) of `origin`: latitude, longitude, height, near where the robot drives.
+        covariance= (3, 3) of these, m², or sigmas= (3,), metres.  lever=, offset=, twist= as in `position_se2`.
+        frame=: the key of the map's pose in that frame; without, the map itself has x to the east and y to the north.
+        """
+        there = enu((latitude, longitude, height), origin)
+        return self._add(positioned("position_se3", key, there, with_information(key, certainty)))
+
+    def velocity_frame_se2(self, frame: Key, velocity: Key, measured: ArrayLike, **sure: Unpack[Certainty]) -> Draft:
+        """A vector2, a velocity along the axes of the map, in another frame (`position_se2`): vx vy (m/s)."""
+        return self.factor("velocity_frame_se2", (frame, velocity), measured, **sure)
+
+    def velocity_frame_se3(self, frame: Key, velocity: Key, measured: ArrayLike, **sure: Unpack[Certainty]) -> Draft:
+        """The same of a vector3: where the frame is that of `gnss`, east north up (m/s), as Doppler shifts tell."""
+        return self.factor("velocity_frame_se3", (frame, velocity), measured, **sure)
 
     def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane looks, in the map: theta (radians)."""
@@ -195,7 +194,7 @@ class Draft:
         self, key: Key, seen: ArrayLike, *, direction: ArrayLike = (0.0, 0.0, -1.0), **certainty: Unpack[Certainty]
     ) -> Draft:
         """A direction of the map (down, unless said otherwise) as the robot sees it: vectors of any length."""
-        both = [*_row("seen", seen, 3), *_row("direction", direction, 3)]
+        both = [*checked_row("seen", seen, 3), *checked_row("direction", direction, 3)]
         return self.factor("attitude_se3", (key,), both, **certainty)
 
     def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[SensorCertainty]) -> Draft:
@@ -206,13 +205,13 @@ class Draft:
         """How far a point3 is from the pose (metres)."""
         return self._seen("range_se3", (pose, point), [distance], certainty)
 
-    def range_between_se2(self, first: Key, second: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
+    def range_between_se2(self, first: Key, second: Key, distance: float, **certainty: Unpack[RangeCertainty]) -> Draft:
         """How far two poses in the plane are apart (metres): robots, or a robot and an anchor with an orientation."""
-        return self.factor("range_between_se2", (first, second), [distance], **certainty)
+        return self._add(sensed("range_between_se2", (first, second), [distance], certainty, RangeCertainty))
 
-    def range_between_se3(self, first: Key, second: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
+    def range_between_se3(self, first: Key, second: Key, distance: float, **certainty: Unpack[RangeCertainty]) -> Draft:
         """How far two poses in space are apart (metres)."""
-        return self.factor("range_between_se3", (first, second), [distance], **certainty)
+        return self._add(sensed("range_between_se3", (first, second), [distance], certainty, RangeCertainty))
 
     def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """Where a point2 is to be seen from the pose (radians, from the x axis to the left)."""
@@ -220,7 +219,33 @@ class Draft:
 
     def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """Where a point3 is to be seen from the pose: a vector of any length in its frame; sigmas: nearly radians."""
-        return self._seen("bearing_se3", (pose, point), _row("direction", direction, 3), certainty)
+        return self._seen("bearing_se3", (pose, point), checked_row("direction", direction, 3), certainty)
+
+    def imu(
+        self,
+        first: Sequence[Key],
+        second: Sequence[Key],
+        samples: ArrayLike,
+        *,
+        noise: ImuNoise,
+        gravity: ArrayLike = (0.0, 0.0, -STANDARD_GRAVITY),
+        bias: ArrayLike = (0.0,) * 6,
+        attitude: ArrayLike | None = None,
+        **certainty: Unpack[Certainty],
+    ) -> Draft:
+        """What an IMU measured between two moments, each a pose (se3), a velocity in the map (vector3) and a bias
+        (vector6): ("x0", "v0", "b0"), ("x1", "v1", "b1").  Those of the second without a value get it from this.
+
+        samples (n, 7), n up to 2000: duration (s), gyroscopes (rad/s), accelerometers (m/s²), as it measured them, from
+        pose to pose (`cut_samples`); the service integrates them at every linearization.
+        gravity: in the map, m/s².  bias: where the noise of the samples is propagated, the best guess of it.
+        attitude: how the IMU is turned on the robot, qx qy qz qw; a bias is along the robot's axes then.
+        How certain it is follows from the noise: sigmas= or information= are beside that, of a residual of sigma 1.
+        """
+        keys = key_numbers([*moment("imu: first", first), *moment("imu: second", second)]).tolist()
+        where = " ".join(["imu", *map(format_symbol, keys)])
+        kind, row = imu_factor(where, turned_samples(where, samples, attitude), noise, gravity, bias)
+        return self.factor(kind, keys, row, **known_by_noise(certainty))
 
     def linear(
         self,
@@ -243,9 +268,9 @@ class Draft:
         """
         numbers = key_numbers(keys).tolist()
         if kinds is None:
-            known = {number: kind for (kind, *_), (keys_of, *_) in self._variables.items() for number in keys_of}
+            known = self._columns.kinds()
             kinds = [known.get(number, "") for number in numbers]
-        self._linear.append(linear_factor(numbers, values, jacobians, residual, kinds, certainty))
+        self._columns.add_linear(linear_factor(numbers, values, jacobians, residual, kinds, certainty))
         return self
 
     def idp_first(
@@ -262,15 +287,15 @@ class Draft:
         sigma_rho=, of that guess, 1/metre; sigma_pixel=, sigma_anchor= and loss= where the usual ones do not do
         (`factorbus.client.certainty.FeatureCertainty`).
         """
-        measured = [*_row("pixel", pixel, 2), rho, *_lens(camera)]
-        sigmas = feature_sigmas(self._joins(pose, feature, "idp_first"), certainty)
+        measured = [*checked_row("pixel", pixel, 2), rho, *_lens(camera)]
+        sigmas = feature_sigmas(self._named("idp_first", (pose, feature)), certainty)
         return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=certainty.get("loss"))
 
     def idp_seen(
         self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
     ) -> Draft:
         """An idp seen again by the pose's camera: u v (pixels)."""
-        return self.factor("idp_seen", (pose, feature), [*_row("pixel", pixel, 2), *_lens(camera)], **certainty)
+        return self.factor("idp_seen", (pose, feature), [*checked_row("pixel", pixel, 2), *_lens(camera)], **certainty)
 
     def point_seen(
         self,
@@ -281,7 +306,7 @@ class Draft:
         **certainty: Unpack[SensorCertainty],
     ) -> Draft:
         """A point3 seen by the pose's camera: u v (pixels)."""
-        measured = [*_row("pixel", pixel, 2), *_lens(camera)]
+        measured = [*checked_row("pixel", pixel, 2), *_lens(camera)]
         return self._seen("point_seen", (pose, point), measured, certainty)
 
     def variable(
@@ -295,86 +320,44 @@ class Draft:
         size = _known(VARIABLE_KINDS, kind).size
         number = key_number(key)
         where = f"{kind} {format_symbol(number)}"
-        row = None if value is None else _row(where, value, size)
+        row = None if value is None else checked_row(where, value, size)
         checked_keywords(where, held, tuple(Held.__annotations__))
         fixed = checked_flag(f"{where}: fixed", held.get("fixed", False))
-        keys, rows, stamps = self._variables.setdefault((kind, row is not None, fixed), ([], [], []))
-        stamp = stamp_number(where, held.get("stamp"))
-        keys.append(number)
-        stamps.append(stamp)
-        if row is not None:
-            rows.append(row)
+        self._columns.add_variable(kind, number, row, fixed, stamp_number(where, held.get("stamp")))
         return self
 
     def factor(
         self,
-        kind: str,
+        kind: str | FactorKind,
         keys: Sequence[Key],
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
     ) -> Draft:
-        """A factor of any kind of `factorbus.proto.kinds`."""
-        of = _known(FACTOR_KINDS, kind)
-        numbers = key_numbers(keys).tolist()
-        where = " ".join([kind, *map(format_symbol, numbers)])
+        """A factor of any kind of `factorbus.proto.kinds`, or of one of your own (`factorbus.client.expressions`)."""
+        of = kind if isinstance(kind, FactorKind) else _known(FACTOR_KINDS, kind)
+        kind, numbers = of.name, key_numbers(keys).tolist()
+        where = " ".join([of.called, *map(format_symbol, numbers)])
         if len(numbers) != len(of.connects):
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
-        row = _row(f"{where}: measured", measured, of.size)
-        name, scale = loss_of(where, certainty.get("loss"))
-        triangle = triangle_of(where, of.dim, certainty, kind)
-        all_keys, all_measured, all_triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
-        scales.append(scale)
-        all_keys.append(numbers)
-        all_measured.append(row)
-        all_triangles.append(triangle)
+        row = checked_row(f"{where}: measured", measured, of.size)
+        loss = loss_of(where, certainty.get("loss"))
+        self._columns.add_factor(kind, numbers, row, triangle_of(where, of.dim, certainty, kind), loss)
         return self
 
     def _seen(self, kind: str, keys: tuple[Key, Key], measured: ArrayLike, certainty: SensorCertainty) -> Draft:
-        """What a sensor measures that may have a mount."""
-        check_names(self._joins(*keys, kind), certainty, SensorCertainty)
-        rest = {name: value for name, value in certainty.items() if name != "mount"}
-        return self._at_mount(kind, keys, certainty.get("mount"), measured, cast("Certainty", rest))
+        """What a sensor measures that may have a mount, a bias, a clock."""
+        return self._add(sensed(kind, keys, measured, certainty))
 
-    def _at_mount(
-        self, kind: str, keys: tuple[Key, Key], mount: Key | None, measured: ArrayLike, certainty: Certainty
-    ) -> Draft:
-        """A factor of this kind, or where there is a mount the one whose last variable that is."""
-        if mount is None:
-            return self.factor(kind, keys, measured, **certainty)
-        return self.factor(f"{kind}_mount", (*keys, mount), measured, **certainty)
+    def _add(self, made: Measured) -> Draft:
+        return self.factor(made.kind, made.keys, made.measured, **made.certainty)
 
-    def _joins(self, first: Key, second: Key, kind: str) -> str:
+    def _named(self, kind: str, keys: tuple[Key, ...]) -> str:
         """What an error says it is about."""
-        return " ".join([kind, *(format_symbol(key_number(key)) for key in (first, second))])
+        return " ".join([kind, *(format_symbol(key_number(key)) for key in keys)])
 
     def batch(self) -> Batch:
         """What has been drafted so far, as columns."""
-        return Batch(
-            tuple(
-                Variables(
-                    kind,
-                    np.array(keys, np.int64),
-                    np.array(rows) if valued else None,
-                    fixed,
-                    np.array(stamps, np.int64) if any(stamp != NO_STAMP for stamp in stamps) else None,
-                )
-                for (kind, valued, fixed), (keys, rows, stamps) in self._variables.items()
-            ),
-            (
-                *(
-                    Factors(
-                        kind,
-                        np.array(keys, np.int64),
-                        np.array(measured),
-                        np.array(information),
-                        loss,
-                        np.array(scales) if loss else None,
-                    )
-                    for (kind, loss), (keys, measured, information, scales) in self._factors.items()
-                ),
-                *self._linear,
-            ),
-        )
+        return self._columns.batch()
 
 
 def batch_of(what: str, given: Batch | Draft) -> Batch:
@@ -388,12 +371,6 @@ def _lens(camera: Camera) -> list[float]:
 
 def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
     if not isinstance(kind, str) or kind not in kinds:
-        raise UnknownKind("draft", str(kind), tuple(kinds))
+        known = kinds.names(str(kind)) if isinstance(kinds, FactorKinds) else tuple(kinds)
+        raise UnknownKind("draft", str(kind), known)
     return kinds[kind]
-
-
-def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
-    row = as_numbers(where, numbers, f"({size},) numbers")
-    if row.shape != (size,):
-        raise BadShape(where, f"shape {row.shape}", f"({size},)")
-    return all_finite(where, row)

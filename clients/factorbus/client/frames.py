@@ -8,6 +8,7 @@ import numpy as np
 
 from factorbus.proto.arrays import F64
 from factorbus.proto.kinds import VARIABLE_KINDS
+from factorbus.proto.roles import AXES, FRAME, MOUNT
 
 # Numbers of a pose, by the space that a kind of variable is in.
 SPACES = {"se2": 3, "point2": 3, "se3": 7, "point3": 7, "idp": 7}
@@ -50,10 +51,19 @@ def difference(measured: F64, pose: F64) -> F64:
     return left if left.size == 3 else left[:6] * (1.0 if left[6] >= 0 else -1.0) ** np.array([0, 0, 0, 1, 1, 1])
 
 
-def moved_values(kind: str, values: F64, T_a_b: F64) -> F64:
-    """Values (n, size) of variables of one kind, given in b, as they are in a; vectors are the same in both."""
-    if VARIABLE_KINDS[kind].is_vector:
+def moved_values(kind: str, values: F64, T_a_b: F64, role: str = "") -> F64:
+    """Values (n, size) of variables of one kind and role (`factorbus.proto.roles`), given in b, as they are in a.
+
+    Vectors are the same in both, unless they are along the axes of the map, and so are mounts.  Of the map's pose f in
+    another frame f ∘ x is the same in both: f ∘ T_b_a.
+    """
+    if role == AXES:
+        return values @ rotation_of(T_a_b).T
+    if VARIABLE_KINDS[kind].is_vector or role == MOUNT:
         return values
+    if role == FRAME:
+        back = inverse(T_a_b)[None]
+        return np.concatenate([compose(f, back) for f in values])
     if kind in ("se2", "se3"):
         return compose(T_a_b, values)
     size = values.shape[1] if kind != "idp" else 3

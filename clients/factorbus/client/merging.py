@@ -22,21 +22,19 @@ from factorbus.client.frames import (
     compose,
     difference,
     inverse,
-    moved_values,
 )
-from factorbus.client.mounts import split_mounts
+from factorbus.client.roles import Roles, roles_of, split_mounts
 from factorbus.client.transform_factors import transform_factors
 from factorbus.client.transform_linear import are_relative
 from factorbus.proto.arrays import F64, I64
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, name_of_kind
 from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, MapGraph, Variables
-from factorbus.proto.mounts import mounts_of, pick_factors
 from factorbus.proto.problems import Problem
+from factorbus.proto.roles import pick_factors, pick_variables
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
 
 ABSOLUTE = ("refuse", "leave_out", "keep")
 _PRIORS = ("prior_se2", "prior_se3")
-_OF_THE_WORLD = tuple(name for name, kind in FACTOR_KINDS.items() if kind.is_absolute)
 _BETWEEN = ("between_se2", "between_se3")
 _SHOWN = 5
 
@@ -127,20 +125,21 @@ def fit_into(
     given = Batch() if anchors is None else batch_of("anchors", anchors)
     size = _size_of(other.batch)
     renamed = _renamed(other.batch, named)
-    mounts = mounts_of(renamed)
+    roles = roles_of(renamed)
     of_robots, renamed = split_mounts(renamed)
     _check_keys(here, _together(of_robots, renamed))
     _check_ends(given, here, _together(of_robots, renamed))
-    kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute, mounts)
+    kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute, roles)
     if absolute == "keep":
         T = np.array([0.0] * size if size == 3 else [0.0] * 6 + [1.0])
         return Fitted(_together(of_robots, _together(kept, given)), T, {}, given.factor_count)
-    T = _frame(here, renamed, given, frame, size)
+    places = _without(renamed.variables, roles.frames)
+    T = _frame(here, places, given, frame, size)
     if not given.factor_count:
-        given = _tie(here, renamed, T, sigmas).batch()
+        given = _tie(here, places, T, sigmas).batch()
     moved = Batch(
-        tuple(g._replace(values=moved_values(g.kind, _values(g), T)) for g in kept.variables),
-        tuple(transform_factors(g, T, mounts) for g in kept.factors),
+        tuple(g._replace(values=roles.moved(g.kind, g.keys, _values(g), T)) for g in kept.variables),
+        tuple(transform_factors(g, T, roles) for g in kept.factors),
     )
     return Fitted(_together(of_robots, _together(moved, given)), T, left_out, given.factor_count)
 
@@ -210,7 +209,7 @@ def _check_ends(anchors: Batch, here: Estimate, renamed: Batch) -> None:
         raise NoAnchor(f"the anchors name {_names(missing)}, which neither this map has nor the other as renamed")
 
 
-def _relative(batch: Batch, absolute: str, mounts: I64) -> tuple[Batch, dict[str, int]]:
+def _relative(batch: Batch, absolute: str, roles: Roles) -> tuple[Batch, dict[str, int]]:
     """Without what is said of the map's own frame, and how many of each kind that were.  Raises AbsoluteFactors."""
     held: dict[str, int] = {}
     fixed = sum(group.keys.size for group in batch.variables if group.fixed)
@@ -218,9 +217,10 @@ def _relative(batch: Batch, absolute: str, mounts: I64) -> tuple[Batch, dict[str
         held["fixed"] = fixed
     factors = []
     for group in batch.factors:
-        stays = are_relative(group, mounts) if FACTOR_KINDS[group.kind].is_linear else _stays(group)
+        stays = are_relative(group, roles) if FACTOR_KINDS[group.kind].is_linear else _stays(group)
         if not stays.all():
-            held[group.kind] = held.get(group.kind, 0) + int((~stays).sum())
+            name = name_of_kind(group.kind)
+            held[name] = held.get(name, 0) + int((~stays).sum())
         if stays.any():
             factors.append(pick_factors(group, stays))
     if absolute == "refuse" and not _is_gauge(batch, held):
@@ -229,7 +229,7 @@ def _relative(batch: Batch, absolute: str, mounts: I64) -> tuple[Batch, dict[str
 
 
 def _stays(group: Factors) -> np.ndarray:
-    return np.full(len(group.keys), group.kind not in _OF_THE_WORLD)
+    return np.full(len(group.keys), not FACTOR_KINDS[group.kind].is_absolute)
 
 
 def _is_gauge(batch: Batch, held: Mapping[str, int]) -> bool:
@@ -240,7 +240,7 @@ def _is_gauge(batch: Batch, held: Mapping[str, int]) -> bool:
     return poses and all(kind in ("fixed", *_PRIORS) for kind in held)
 
 
-def _frame(here: Estimate, renamed: Batch, anchors: Batch, frame: ArrayLike | None, size: int) -> F64:
+def _frame(here: Estimate, there: Sequence[Variables], anchors: Batch, frame: ArrayLike | None, size: int) -> F64:
     """T_a_b: as given, or by the relative pose among the anchors that agrees best with all of them."""
     if frame is not None:
         given = np.array(frame, np.float64)
@@ -249,7 +249,7 @@ def _frame(here: Estimate, renamed: Batch, anchors: Batch, frame: ArrayLike | No
                 f"frame is {given.tolist()}; wanted {size} numbers, where the other map's origin is in this one"
             )
         return given if size == 3 else np.array([*given[:3], *given[3:] / np.linalg.norm(given[3:])])
-    links = _links(_poses(here.variables), _poses(renamed.variables), anchors)
+    links = _links(_poses(here.variables), _poses(there), anchors)
     if not links:
         raise NoAnchor("there is no relative pose between a pose of this map and one of the other")
     return min((T for T, *_ in links), key=lambda T: sum(_off(T, *rest) for _, *rest in links))
@@ -282,11 +282,11 @@ def _full(triangle: F64, size: int) -> F64:
     return full + np.triu(full, 1).T
 
 
-def _tie(here: Estimate, renamed: Batch, T: F64, sigmas: ArrayLike | None) -> Draft:
+def _tie(here: Estimate, there: Sequence[Variables], T: F64, sigmas: ArrayLike | None) -> Draft:
     """A relative pose that says what T says: between the poses that hold the two maps, or their first."""
     if sigmas is None:
         raise NoAnchor("frame says where the other map is, and nothing says how certain that is")
-    (a, x_a), (b, x_b) = _reference(here.variables, T.size), _reference(renamed.variables, T.size)
+    (a, x_a), (b, x_b) = _reference(here.variables, T.size), _reference(there, T.size)
     z = compose(inverse(x_a), compose(T, x_b[None]))[0]
     return Draft().factor("between_se2" if z.size == 3 else "between_se3", (a, b), z, sigmas=sigmas)
 
@@ -297,6 +297,10 @@ def _reference(groups: Sequence[Variables], size: int) -> tuple[int, F64]:
             first = int(np.argmin(group.keys))
             return int(group.keys[first]), _values(group)[first]
     raise NoAnchor("one of the maps has no pose in the space of the other's")
+
+
+def _without(groups: Sequence[Variables], keys: I64) -> list[Variables]:
+    return [pick_variables(group, ~np.isin(group.keys, keys)) for group in groups]
 
 
 def _together(batch: Batch, anchors: Batch) -> Batch:

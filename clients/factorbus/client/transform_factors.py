@@ -3,17 +3,29 @@
 import numpy as np
 
 from factorbus.client.frames import rotation_of
+from factorbus.client.roles import Roles
 from factorbus.client.transform_linear import transform_linear
-from factorbus.proto.arrays import F64, I64
+from factorbus.proto.arrays import F64
+from factorbus.proto.inertial import GRAVITY
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Factors
 
 
-def transform_factors(group: Factors, T_a_b: F64, mounts: I64) -> Factors:
-    """Relative factors given in b, as they are in a.  mounts: keys of what is on a robot, and does not move."""
-    if FACTOR_KINDS[group.kind].is_linear:
-        return transform_linear(group, T_a_b, mounts)
+def transform_factors(group: Factors, T_a_b: F64, roles: Roles) -> Factors:
+    """Relative factors given in b, as they are in a.  roles: of variables that are no places in the map."""
+    kind = FACTOR_KINDS[group.kind]
+    if kind.is_linear:
+        return transform_linear(group, T_a_b, roles)
+    if kind.samples:
+        return _transform_inertial(group, T_a_b)
     return _transform_first(group, T_a_b) if group.kind == "idp_first" else group
+
+
+def _transform_inertial(group: Factors, T_a_b: F64) -> Factors:
+    """Gravity turns with the map; what an IMU measures is in its own frame."""
+    measured = group.measured.copy()
+    measured[:, GRAVITY : GRAVITY + 3] = measured[:, GRAVITY : GRAVITY + 3] @ rotation_of(T_a_b).T
+    return group._replace(measured=measured)
 
 
 def _transform_first(group: Factors, T_a_b: F64) -> Factors:

@@ -8,22 +8,35 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.expressions.declaration import Declaration
+from factorbus.proto.expressions.evaluate import evaluate
+from factorbus.proto.expressions.operations import value_size
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import parts_of
 from factorbus.proto.messages import Factors, Variables
+from factorbus.viz.derived_residuals import derived_residual
+from factorbus.viz.inertial import inertial_residual
 
 _WIDEST = 7  # numbers of a pose in space
 
 
 def chi2_of_factors(group: Factors, values: "Values") -> F64:
     """rᵀ Ω r of each factor of `group` (m,); NaN where a variable has no value or the kind is not one of ours."""
-    known = FACTOR_KINDS.get(group.kind)
-    residual = _linear(group.kind) if known is not None and known.is_linear else _RESIDUALS.get(group.kind)
+    residual = _residual_of(group.kind)
     if residual is None or not len(group.keys):
         return np.full(len(group.keys), np.nan)
     r = residual(*(values.rows(column) for column in group.keys.T), group.measured)
     omega = _full(group.information, r.shape[1])
     return np.einsum("mi,mij,mj->m", r, omega, r)
+
+
+def _residual_of(kind: str) -> Callable[..., F64] | None:
+    known = FACTOR_KINDS.get(kind)
+    if known is not None and known.own is not None:
+        return _of_own(known.own)
+    if known is not None and known.is_linear:
+        return _linear(kind)
+    return inertial_residual if known is not None and known.samples else _RESIDUALS.get(kind)
 
 
 class Values:
@@ -145,12 +158,12 @@ def _less_idp(y: F64, x: F64) -> F64:
     return step
 
 
-def _sensor_se2(pose: F64, mount: F64) -> F64:
+def _compose_se2(pose: F64, mount: F64) -> F64:
     """pose ∘ mount in the plane."""
     return np.column_stack([pose[:, :2] + _turned_in_plane(pose, mount[:, :2]), pose[:, 2:3] + mount[:, 2:3]])
 
 
-def _sensor_se3(pose: F64, mount: F64) -> F64:
+def _compose_se3(pose: F64, mount: F64) -> F64:
     """pose ∘ mount in space."""
     u, w = pose[:, 3:6], pose[:, 6:7]
     v, s = mount[:, 3:6], mount[:, 6:7]
@@ -159,13 +172,14 @@ def _sensor_se3(pose: F64, mount: F64) -> F64:
     return np.column_stack([place, w * v + s * u + np.cross(u, v), scalar])
 
 
-def _at_mount(kind: str) -> Callable[..., F64]:
-    """The residual of a kind with the sensor's poses in place of the robot's; the mount is the last variable."""
-    of, connects = _RESIDUALS[kind], FACTOR_KINDS[kind].connects
-    sensor = _sensor_se2 if connects[0] == "se2" else _sensor_se3
+def _of_own(declared: Declaration) -> Callable[..., F64]:
+    """The residual of a kind that a client has written itself, factor by factor."""
+    sizes = [value_size(kind) for kind in declared.types[: len(declared.variables)]]
 
-    def residual(first: F64, second: F64, mount: F64, z: F64) -> F64:
-        return of(sensor(first, mount), sensor(second, mount) if connects[1] == connects[0] else second, z)
+    def residual(*ends: F64) -> F64:
+        rows = zip(*ends, strict=True)
+        found = [evaluate(declared, [x[:n] for x, n in zip(row, sizes, strict=False)], row[-1]) for row in rows]
+        return np.array(found).reshape(-1, declared.residual_size)
 
     return residual
 
@@ -194,9 +208,13 @@ _RESIDUALS: dict[str, Callable[..., F64]] = {
     "range_se3": lambda a, p, z: _distance(a, p, z, 3),
     "range_between_se2": lambda a, b, z: _distance(a, b, z, 2),
     "range_between_se3": lambda a, b, z: _distance(a, b, z, 3),
+    "velocity_frame_se2": lambda f, v, z: _turned_in_plane(f, v) - z,
+    "velocity_frame_se3": lambda f, v, z: _turned_in_space(f, v[:, :3]) - z,
     "bearing_se2": lambda a, p, z: _bearing_range(a, p, np.column_stack([z, z]))[:, :1],
     "bearing_se3": lambda a, p, z: _unit(_into_space(a, p)) - _unit(z),
 }
 _RESIDUALS |= {
-    name: _at_mount(kind.base) for name, kind in FACTOR_KINDS.items() if kind.base and kind.base in _RESIDUALS
+    name: derived_residual(kind, _RESIDUALS[kind.base], _compose_se2 if kind.connects[0] == "se2" else _compose_se3)
+    for name, kind in FACTOR_KINDS.items()
+    if kind.base in _RESIDUALS
 }

@@ -1,84 +1,23 @@
-"""The kinds of variables and factors as the wire knows them: names, sizes and what connects to what.
+"""The kinds of factors as the wire knows them: names, sizes and what connects to what.
 
 The mathematics of each kind (residual, Jacobians, ⊞) is the solver's; this table is all a client needs to
 build and read messages, and a test holds the two against each other.  A name never changes its meaning.
 """
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+from factorbus.proto import inertial
+from factorbus.proto.derived_kinds import derived_kinds
+from factorbus.proto.expressions.declaration import BadExpression, Declaration
+from factorbus.proto.expressions.formula import MOST_CHARACTERS, read_formula, write_formula
+from factorbus.proto.expressions.operations import name_of, value_size, zero_of
+from factorbus.proto.factor_kind import LINEAR, FactorKind
+from factorbus.proto.variable_kinds import POSE2, POSE3, VARIABLE_KINDS
 from factorbus.wording import counted
 
-
-@dataclass(frozen=True, slots=True)
-class VariableKind:
-    """One kind of variable: `size` numbers are stored and sent, `dim` is the size of its tangent space."""
-
-    name: str
-    size: int
-    dim: int
-    values: str
-    is_pose: bool = False
-
-    @property
-    def is_vector(self) -> bool:
-        """Whether it is plain numbers, which no frame moves."""
-        return self.name.startswith("vector")
-
-
-@dataclass(frozen=True, slots=True)
-class FactorKind:
-    """One kind of factor: `size` numbers measured, a residual of `dim`, an information matrix dim × dim.
-
-    measured, residual: for people, and for the table in proto/README.md.  There the variables are a and b of two poses,
-    l of a point and y of a feature seen from pose a, m of a mount, and x, or x₁ and x₂, of others.
-    example: a measurement, for the golden message of the kind
-    half_angles: the last three rows of the residual are the vector part of a quaternion
-    base: the kind that this is with the pose of a sensor, whose mount on the robot is the last variable
-    """
-
-    name: str
-    connects: tuple[str, ...]
-    size: int
-    dim: int
-    measured: str
-    residual: str
-    example: tuple[float, ...]
-    half_angles: bool = False
-    base: str = ""
-
-    def __post_init__(self) -> None:
-        if len(self.example) != self.size:
-            raise ValueError(
-                f"the factor kind {self.name!r} has the size {self.size}, and its example {len(self.example)}; "
-                "give an example of a measurement"
-            )
-
-    @property
-    def information_size(self) -> int:
-        """Numbers in the upper triangle of the information matrix, row by row."""
-        return self.dim * (self.dim + 1) // 2
-
-    @property
-    def is_absolute(self) -> bool:
-        """Whether it is known in the map's frame, and not of variables relative to each other."""
-        return len(self.connects) == 1
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether it is a linear model of its variables."""
-        return self.name.startswith(_LINEAR)
-
-    @property
-    def sees_landmark(self) -> bool:
-        """Whether it connects a pose with what is no pose."""
-        return not self.is_linear and [VARIABLE_KINDS[end].is_pose for end in self.connects] == [True, False]
-
-
-_POSE2 = "x y (metres), theta (radians)"
-_POSE3 = "x y z (metres), unit quaternion qx qy qz qw"
 _PIXEL = "u v (pixels)"
 _RADTAN = (1.0, 400.0, 401.0, 320.0, 240.0, 0.0, -0.25, 0.125, 0.001, -0.002, 0.0)
 _LENS = "lens (11 numbers: `factorbus.proto.camera.Camera.lens`)"
@@ -86,23 +25,9 @@ _LENS = "lens (11 numbers: `factorbus.proto.camera.Camera.lens`)"
 # What a factor that is far off may count instead of r'Wr, by the name of the loss; its scale is in standard deviations.
 LOSSES = ("huber", "cauchy", "geman-mcclure", "tukey", "dcs")
 
-VARIABLE_KINDS = {
-    kind.name: kind
-    for kind in (
-        VariableKind("se2", 3, 3, _POSE2, is_pose=True),
-        VariableKind("se3", 7, 6, _POSE3, is_pose=True),
-        VariableKind("point2", 2, 2, "x y (metres)"),
-        VariableKind("point3", 3, 3, "x y z (metres)"),
-        VariableKind("idp", 6, 6, "x y z of the first camera (metres), theta, phi (radians), rho (1/metre)"),
-        *(VariableKind(f"vector{n}", n, n, f"{counted(n, 'number')}, of any units") for n in range(1, 10)),
-    )
-}
-
-
 # The most variables of a linear factor; it has as many rows as they have scalars, and one more, at most.
 MOST_JOINED = 128
 LINEAR_NAME = "linear_ROWS_KIND_KIND..."
-_LINEAR = "linear_"
 _LONGEST = len("linear_1000") + MOST_JOINED * len("_vector9")  # characters of such a name
 _LINEAR_FORM = re.compile(r"linear_([1-9][0-9]{0,3})((?:_[a-z0-9]+)+)")
 
@@ -128,9 +53,25 @@ def linear_kind(rows: int, ends: tuple[str, ...]) -> FactorKind:
     return FactorKind(name, ends, size, rows, measured, "Σ Hₙ (xₙ ⊟ yₙ) + b", (*y, *[0.25] * (size - values)))
 
 
+@lru_cache(maxsize=1024)
+def imu_kind(samples: int) -> FactorKind:
+    """The kind of inertial factors with that many samples.  Raises ValueError: none, or too many."""
+    name, example = inertial.imu_name(samples), (*inertial.EXAMPLE, *inertial.EXAMPLE_SAMPLE * samples)
+    texts = inertial.MEASURED, inertial.DIFFERENCE
+    return FactorKind(name, inertial.ENDS, len(example), inertial.RESIDUAL, *texts, example, roles=inertial.ROLES)
+
+
+def _imu_of_name(name: str) -> FactorKind | None:
+    """The inertial kind of that name; None: there is none."""
+    try:
+        return imu_kind(inertial.samples_of(name))
+    except ValueError:
+        return None
+
+
 def _linear_of_name(name: str) -> FactorKind | None:
     """The linear kind of that name; None: there is none."""
-    if not name.startswith(_LINEAR) or len(name) > _LONGEST:
+    if not name.startswith(LINEAR) or len(name) > _LONGEST:
         return None
     try:
         return _read_linear(name)
@@ -146,61 +87,95 @@ def _read_linear(name: str) -> FactorKind:
     return linear_kind(int(found[1]), tuple(found[2][1:].split("_")))
 
 
+def own_kind(declared: Declaration) -> FactorKind:
+    """The kind that a declaration is.  Raises BadExpression: its name is one of the others'."""
+    if declared.name in FACTOR_KINDS or declared.name.startswith((LINEAR, inertial.PREFIX)):
+        raise BadExpression(f"{declared.name} is a kind that there is already; wanted another name")
+    ends, name = tuple(kind for _, kind in declared.variables), write_formula(declared)
+    measured, size = name_of(declared.measured), value_size(declared.measured)
+    return FactorKind(
+        name, ends, size, declared.residual_size, measured, name, zero_of(declared.measured), own=declared
+    )
+
+
+@lru_cache(maxsize=256)
+def _own_of_name(name: str) -> FactorKind | None:
+    """The own kind that a formula is; None: it is none."""
+    try:
+        return own_kind(read_formula(name))
+    except BadExpression:
+        return None
+
+
+def _found_by_name(name: str) -> FactorKind | None:
+    """Of the families of kinds, of which there are more than can be listed."""
+    if _is_formula(name):
+        return _own_of_name(name) if len(name) <= MOST_CHARACTERS else None
+    return _imu_of_name(name) if name.startswith(inertial.PREFIX) else _linear_of_name(name)
+
+
+def _is_formula(name: str) -> bool:
+    """Whether a kind is meant that a client has written itself: its name has at most 63 characters before "("."""
+    return "(" in name[:64]
+
+
+def name_of_kind(kind: str) -> str:
+    """For people: of an own kind what stands before its variables, of any other its name."""
+    return kind.partition("(")[0]
+
+
 class FactorKinds(dict[str, FactorKind]):
-    """The kinds by name.  Those of linear factors, of which there is one for any rows and variables, are found by name
-    as well, and are not among the entries."""
+    """The kinds by name.  Those of linear factors, one for any rows and variables, of inertial factors, one for any
+    number of samples, and those of one's own, whose name is their formula, are found by name as well, and are not among
+    the entries."""
 
     def __missing__(self, name: str) -> FactorKind:
-        if (kind := _linear_of_name(name)) is None:
+        if (kind := _found_by_name(name)) is None:
             raise KeyError(name)
         return kind
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or (isinstance(name, str) and _linear_of_name(name) is not None)
+        return super().__contains__(name) or (isinstance(name, str) and _found_by_name(name) is not None)
 
     def get(self, name: str, default: Any = None) -> Any:
         """The kind of that name, or `default`."""
         found = super().get(name)
-        return found or _linear_of_name(name) or default
+        return found or _found_by_name(name) or default
 
     def names(self, unknown: str = "") -> tuple[str, ...]:
-        """For a person: all names, and the form of those of linear factors.
+        """For a person: all names, and the form of those of families.
 
         Of an `unknown` one that begins as these do, what is wrong with it.
         """
-        if unknown.startswith(_LINEAR):
-            if len(unknown) > _LONGEST:
-                return (f"{LINEAR_NAME}, of up to {MOST_JOINED} variables",)
+        if _is_formula(unknown):
             try:
-                _read_linear(unknown)
-            except ValueError as why:
-                return (f"{LINEAR_NAME} ({why})",)
-        return (*self, LINEAR_NAME)
-
-
-_WITH_MOUNT = (
-    *("between_se2", "between_se3", "landmark_se2", "landmark_se3", "bearing_range_se2", "bearing_se2", "bearing_se3"),
-    *("range_se2", "range_se3", "point_seen"),
-)
-
-
-def _with_mount(kind: FactorKind) -> FactorKind:
-    """`kind` as measured by a sensor at m on the robot: with a ∘ m in place of the pose a."""
-    instead = "a ∘ m and b ∘ m for a and b" if kind.connects[0] == kind.connects[1] else "a ∘ m for a"
-    ends, residual = (*kind.connects, kind.connects[0]), f"that of {kind.name} with {instead}"
-    return replace(kind, name=f"{kind.name}_mount", connects=ends, residual=residual, base=kind.name)
+                own_kind(read_formula(unknown))
+            except BadExpression as why:
+                return (f"a formula ({why})",)
+        if unknown.startswith(LINEAR) and len(unknown) > _LONGEST:
+            return (f"{LINEAR_NAME}, of up to {MOST_JOINED} variables",)
+        for prefix, form, read in (
+            (LINEAR, LINEAR_NAME, _read_linear),
+            (inertial.PREFIX, inertial.NAME, inertial.samples_of),
+        ):
+            if unknown.startswith(prefix):
+                try:
+                    read(unknown)
+                except ValueError as why:
+                    return (f"{form} ({why})",)
+        return (*self, LINEAR_NAME, inertial.NAME, "or a formula")
 
 
 FACTOR_KINDS = FactorKinds(
     (kind.name, kind)
     for kind in (
-        FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
+        FactorKind("prior_se2", ("se2",), 3, 3, POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
         FactorKind(
             "prior_se3",
             ("se3",),
             7,
             6,
-            _POSE3 + ", in the map",
+            POSE3 + ", in the map",
             "z⁻¹ ∘ x as (x, y, z, qx, qy, qz), sign with qw ≥ 0",
             (1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8),
             half_angles=True,
@@ -212,7 +187,7 @@ FACTOR_KINDS = FactorKinds(
             ("se2", "se2"),
             3,
             3,
-            _POSE2 + ": the second pose in the first one's frame",
+            POSE2 + ": the second pose in the first one's frame",
             "z⁻¹ ∘ (a⁻¹ ∘ b) as (x, y, wrap θ)",
             (1.0, 0.0, 0.25),
         ),
@@ -221,7 +196,7 @@ FACTOR_KINDS = FactorKinds(
             ("se3", "se3"),
             7,
             6,
-            _POSE3 + ": the second pose in the first one's frame",
+            POSE3 + ": the second pose in the first one's frame",
             "z⁻¹ ∘ (a⁻¹ ∘ b) as (x, y, z, qx, qy, qz), qw ≥ 0",
             (1.0, 0.0, 0.5, 0.0, 0.0, 0.6, 0.8),
             half_angles=True,
@@ -330,10 +305,30 @@ FACTOR_KINDS = FactorKinds(
             "u/‖u‖ − z/‖z‖, u = Rₐᵀ (l − tₐ)",
             (2.0, 1.0, 0.5),
         ),
+        FactorKind(
+            "velocity_frame_se2",
+            ("se2", "vector2"),
+            2,
+            2,
+            "vx vy in the frame f (m/s), as Doppler shifts tell",
+            "R_f v − z, v along the axes of the map",
+            (1.5, -0.5),
+            roles=("frame", "axes"),
+        ),
+        FactorKind(
+            "velocity_frame_se3",
+            ("se3", "vector3"),
+            3,
+            3,
+            "vx vy vz in the frame f (m/s), as Doppler shifts tell",
+            "R_f v − z, v along the axes of the map",
+            (1.5, -0.5, 0.25),
+            roles=("frame", "axes"),
+        ),
     )
 )
-# And those of a sensor whose mount is estimated: of all that one pose measures of another, or of a point.
-FACTOR_KINDS.update((f"{name}_mount", _with_mount(FACTOR_KINDS[name])) for name in _WITH_MOUNT)
+# And those that these become with further variables: a mount, a bias, a scale, another frame, a lever arm, a clock.
+FACTOR_KINDS.update([(kind.name, kind) for kind in derived_kinds(FACTOR_KINDS)])
 
 
 @dataclass(frozen=True, slots=True)

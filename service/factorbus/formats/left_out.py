@@ -12,7 +12,8 @@ _SHOWN = 5
 # Names that are nouns have a singular; names of records and kinds do not.
 _ONE = {
     "vertices": "vertex", "poses": "pose", "points": "point", "landmarks": "landmark", "variables": "variable",
-    "factors": "factor", "time stamps": "time stamp", "fixed variables": "fixed variable", "mounts": "mount",
+    "factors": "factor", "time stamps": "time stamp", "fixed variables": "fixed variable",
+    "mounts": "mount", "frames": "frame",
     "ground truth values": "ground truth value", "potential outliers": "potential outlier", "outliers": "outlier",
 }  # fmt: skip
 

@@ -57,7 +57,7 @@ def delay_points(batch: Batch, ends: tuple[I64, ...], rank: I64, fixed: np.ndarr
         entry[point] = min(_met(seen, poses), int(placing[point]))
 
 
-def composed(batch: Batch, ends: tuple[I64, ...], rank: I64, entry: I64, known: Mapping[int, F64]) -> F64:
+def composed_odometry(batch: Batch, ends: tuple[I64, ...], rank: I64, entry: I64, known: Mapping[int, F64]) -> F64:
     """Where the 2D poses are by composed odometry, each from the pose nearest in time that was in before: (N, 3).
 
     known: values of poses that have one, by row.

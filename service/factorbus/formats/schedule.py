@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.formats.errors import FormatError
-from factorbus.formats.parallax import composed, delay_points
+from factorbus.formats.parallax import composed_odometry, delay_points
 from factorbus.formats.ranging import RANGES, Ranges, refuse_unvalued
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
@@ -148,9 +148,8 @@ def scheduled(file: str, batch: Batch, names: Roster, use_values: bool = False) 
     _enter_points(batch, names, entry, ranges)
     if any(group.kind == "bearing_se2" for group in batch.factors):
         known = _known_poses(batch, names, root, given, use_values)
-        delay_points(
-            batch, names.ends, names.rank, names.fixed, composed(batch, names.ends, names.rank, entry, known), entry
-        )
+        poses = composed_odometry(batch, names.ends, names.rank, entry, known)
+        delay_points(batch, names.ends, names.rank, names.fixed, poses, entry)
     if (entry < 0).any():
         raise _unreached(file, names, entry, ranges)
     return Schedule(entry, root, given)

@@ -10,8 +10,8 @@ from factorbus.formats.errors import FormatError
 from factorbus.formats.left_out import shown
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Variables
-from factorbus.proto.mounts import mounts_of
 from factorbus.proto.problems import SeveralRobots
+from factorbus.proto.roles import poses_aside
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol, symbol_parts
 from factorbus.wording import counted
@@ -33,11 +33,11 @@ def trajectories(batch: Batch, form: str) -> dict[str, list[Stamped]]:
 
     A robot is the letter of its keys.  Its order is that of the time stamps where all its poses have one, else that of
     the numbers of its keys, which of a key without a letter is all of it.  2D poses lie in the plane z = 0.  Points are
-    left out, and so are mounts, which are places on a robot.  Raises FormatError, which speaks of `form`, for a pose
-    without a value.
+    left out, and so are poses that are no places in the map (`factorbus.proto.roles`).  Raises FormatError, which
+    speaks of `form`, for a pose without a value.
     """
     robots: dict[str, list[Stamped]] = defaultdict(list)
-    mounts = set(mounts_of(batch).tolist())
+    aside = set(poses_aside(batch).tolist())
     for group in batch.variables:
         if group.kind in ("se2", "se3"):
             if group.values is None:
@@ -45,7 +45,7 @@ def trajectories(batch: Batch, form: str) -> dict[str, list[Stamped]]:
             lift = _lifted if group.kind == "se2" else list
             rows = zip(group.keys.tolist(), _stamps(group).tolist(), group.values.tolist(), strict=True)
             for key, stamp, value in rows:
-                if key in mounts:
+                if key in aside:
                     continue
                 letter, number = symbol_parts(key)
                 robots[letter].append(Stamped(key, number, None if stamp == NO_STAMP else stamp, lift(value)))

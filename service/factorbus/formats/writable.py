@@ -9,13 +9,16 @@ import numpy as np
 from factorbus.formats.errors import FormatError
 from factorbus.formats.left_out import LeftOut, shown
 from factorbus.proto.arrays import I64
+from factorbus.proto.kinds import name_of_kind
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.mounts import mounts_of, pick_factors, pick_variables
+from factorbus.proto.roles import FRAME, MOUNT, keys_of_role, pick_factors, pick_variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
 # How many of what are left out, by name and reason.  A kind may come in several groups: each is said once for the file.
 _Lost = Counter[tuple[str, str]]
+# Poses that are no places in the map: their role, what they are called, and what there is no record for.
+_ASIDE = ((MOUNT, "mounts", "where a sensor is on a robot"), (FRAME, "frames", "where the map is in another frame"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +48,8 @@ def writable(batch: Batch, form: Form, left: LeftOut) -> Batch:
     """What of `batch` there are records for.  Raises FormatError for a factor of a variable that is not there."""
     _refuse_unknown(batch, form.name)
     lost = _Lost()
-    batch = _without_mounts(batch, form, lost)
+    for role, name, why in _ASIDE:
+        batch = _without(batch, keys_of_role(batch, role), form, name, f"{form.name} has no record for {why}", lost)
     variables = []
     for group in batch.variables:
         if group.kind in form.variables:
@@ -75,7 +79,7 @@ def number_text(numbers: Iterable[float]) -> str:
 
 def _writable_factors(group: Factors, gone: I64, form: Form, lost: _Lost) -> Factors | None:
     if group.kind not in form.measured or np.isin(group.keys, gone).any():
-        lost[group.kind, _no_record(form)] += len(group.keys)
+        lost[name_of_kind(group.kind), _no_record(form)] += len(group.keys)
         return None
     kept = np.ones(len(group.keys), bool)
     if group.kind in ("position_se2", "position_se3"):
@@ -93,19 +97,21 @@ def _no_record(form: Form) -> str:
     return f"{form.name} has no record for such factors"
 
 
-def _without_mounts(batch: Batch, form: Form, lost: _Lost) -> Batch:
-    """Without the places of sensors on a robot, and all factors on them: as poses of the map they would mislead."""
-    mounts = mounts_of(batch)
-    if not mounts.size:
+def _without(batch: Batch, aside: I64, form: Form, name: str, why: str, lost: _Lost) -> Batch:
+    """Without poses that are no places in the map, and all factors on them: as poses of the map they would mislead.
+
+    aside: their keys; name, why: as `LeftOut.drop` says them.
+    """
+    if not aside.size:
         return batch
-    variables, factors, why = [], [], f"{form.name} has no record for where a sensor is on a robot"
+    variables, factors = [], []
     for group in batch.variables:
-        stays = ~np.isin(group.keys, mounts)
-        lost["mounts", why] += int((~stays).sum())
+        stays = ~np.isin(group.keys, aside)
+        lost[name, why] += int((~stays).sum())
         if stays.any():
             variables.append(pick_variables(group, stays))
     for group in batch.factors:
-        stays = np.asarray(~np.isin(group.keys, mounts).any(axis=1))
+        stays = np.asarray(~np.isin(group.keys, aside).any(axis=1))
         known = group.kind in form.measured
         lost[group.kind, why if known else _no_record(form)] += int((~stays).sum())
         if stays.any():

@@ -31,7 +31,8 @@ def _sources() -> str:
     for path in sorted(folder.rglob("*.py")):
         text = path.read_bytes()
         digest.update(f"{path.relative_to(folder).as_posix()} {len(text)}\n".encode() + text)
-    digest.update(WIRE_KINDS.read_bytes())
+    for path in WIRE_KINDS:
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 
 

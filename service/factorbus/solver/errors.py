@@ -6,6 +6,7 @@
     ├── TooLarge               too_large               more than is searched through in one piece
     ├── NoBackend              no_backend              a backend whose package is not installed
     ├── UnknownKind            unknown_kind            a kind of variable or factor that does not exist
+    ├── KindTaken              kind_taken              an own kind with the name of another that the map has
     ├── BadShape               bad_shape               arrays whose sizes or types do not fit their kind or each other
     ├── DuplicateVariable      duplicate_variable      a key that is taken already
     ├── UnknownVariable        unknown_variable        a factor on a key that no variable has
@@ -17,6 +18,7 @@
     ├── BadQuaternion          bad_quaternion          a quaternion that is not of unit length
     ├── BadRange               bad_range               a range that is not positive
     ├── BadDirection           bad_direction           a direction that is no vector of some length
+    ├── BadSamples             bad_samples             samples of an IMU without duration, or noise that cannot be
     ├── BadLens                bad_lens                a lens that cannot be
     ├── BadObservation         bad_observation         a pixel of what the camera cannot see
     ├── BadLoss                bad_loss                a loss that does not exist, or a scale that is not positive
@@ -103,12 +105,31 @@ class NoBackend(SolverError):
         )
 
 
+_MOST_SHOWN = 200  # characters of a formula
+
+
+def _cut(formula: str) -> str:
+    return formula if len(formula) <= _MOST_SHOWN else f"{formula[:_MOST_SHOWN]}…"
+
+
 class UnknownKind(SolverError):
     code = "unknown_kind"
 
     def __init__(self, what: str, seen: str, known: Sequence[str]) -> None:
         wanted = f"one of {', '.join(known)}"
         super().__init__(f"there is no kind of {what} {seen!r}; wanted {wanted}", seen=seen, wanted=wanted)
+
+
+class KindTaken(SolverError):
+    code = "kind_taken"
+
+    def __init__(self, name: str, here: str, given: str) -> None:
+        super().__init__(
+            f"{name} is {_cut(here)} in this map, and is {_cut(given)} now; wanted another name for another kind",
+            kind=name,
+            here=here,
+            given=given,
+        )
 
 
 class BadShape(SolverError):
@@ -227,12 +248,15 @@ class BadDirection(SolverError):
     code = "bad_direction"
 
     def __init__(self, where: str) -> None:
-        super().__init__(
-            f"{where}: a direction has length 0, wanted a vector of any other length",
-            where=where,
-            seen="length 0",
-            wanted="a vector of any other length",
-        )
+        seen, wanted = "length 0", "a vector of any other length"
+        super().__init__(f"{where}: a direction has {seen}, wanted {wanted}", where=where, seen=seen, wanted=wanted)
+
+
+class BadSamples(SolverError):
+    code = "bad_samples"
+
+    def __init__(self, where: str, seen: str, wanted: str) -> None:
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=seen, wanted=wanted)
 
 
 class BadLens(SolverError):

@@ -350,10 +350,11 @@ def _factor_line(explained: Any, step: Any) -> str:
 
 
 def _named(explained: Any) -> str:
+    from factorbus.proto.kinds import name_of_kind
     from factorbus.proto.symbols import format_symbol
 
     ends = ", ".join(format_symbol(key) for key in explained["keys"])
-    return f"{explained['factor']} {explained['kind']} ({ends})"
+    return f"{explained['factor']} {name_of_kind(explained['kind'])} ({ends})"
 
 
 def _word(plausible: bool) -> str:
@@ -373,10 +374,13 @@ def _read(path: Path, dialect: str | None, strict: bool) -> Any:
 
 
 def _described(factors: tuple[Any, ...]) -> list[str]:
+    from factorbus.proto.kinds import name_of_kind
     from factorbus.proto.symbols import format_symbol
 
     return [
-        f"{group.kind} ({', '.join(format_symbol(int(key)) for key in row)})" for group in factors for row in group.keys
+        f"{name_of_kind(group.kind)} ({', '.join(format_symbol(int(key)) for key in row)})"
+        for group in factors
+        for row in group.keys
     ]
 
 

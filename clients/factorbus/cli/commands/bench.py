@@ -13,7 +13,7 @@ from factorbus.cli.process.options import json_option
 
 BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
 LONG = ("every-step", "paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
-ASKED = ("ask", "digest", "mounts")  # a minute or two; on request
+ASKED = ("ask", "digest", "calibration", "inertial", "own")  # a minute or two; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -44,7 +44,12 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;
                --inserts, --minutes
     digest     the report of every step and the bits of every estimate, as digests; --out FOLDER, --against FOLDER
-    mounts     mounts of sensors found out by simulated drives: how far off in units of their covariance; --seeds
+    calibration   what sensors hide (mounts, scale, frame, clock, bias), found out by simulated drives: how far off in
+               units of its covariance; --seeds, --only
+    inertial   drives with an IMU and GNSS that ship in the gtsam wheel, online, beside iSAM2 with the same factors;
+               --only, --every
+    own        a kind of factor written as a formula beside the built-in one, and a Python factor in GTSAM: time of a
+               step; --only, --poses
     all        cholesky, bus, idp, ros2 and journal: some minutes
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read

@@ -69,13 +69,13 @@ def map_command(
     from factorbus.cli.driving.aligned_truth import aligned_truth
     from factorbus.cli.driving.picture import draw
     from factorbus.cli.driving.plot_source import graph_of, solved, spread_in, with_values
-    from factorbus.client.mounts import of_the_map
+    from factorbus.client.roles import of_the_map
     from factorbus.viz import DriveHistory
 
     drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict))
     drawn = solved(drawn, on_file=connect is None) if solve else with_values(drawn)
     path = drawn.file("map", out)
-    estimate = of_the_map(drawn.graph)  # what is on a robot is drawn nowhere
+    estimate = of_the_map(drawn.graph)  # what is on a robot, or another frame, is drawn nowhere
     placed = replace(drawn, graph=drawn.graph._replace(variables=estimate))
     spread = spread_in(placed, connect, ellipses, zenoh) if ellipses else None
     truth = aligned_truth(drawn.truth, estimate)

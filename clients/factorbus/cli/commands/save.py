@@ -64,15 +64,15 @@ def command(
 
 
 def _robots(joined: "Map", robot: str | None) -> list[str]:
-    """The letters of the robots to write; "" for keys without one.  Mounts are no robots.  Raises Stopped."""
-    from factorbus.proto.mounts import mounts_of
+    """The letters of the robots to write; "" for keys without one; mounts and frames are none.  Raises Stopped."""
+    from factorbus.proto.roles import poses_aside
     from factorbus.proto.symbols import symbol_parts
 
     groups = [group.keys for group in joined.ask_estimate().variables if group.kind in ("se2", "se3")]
     poses = {key for keys in groups for key in keys.tolist()}
     there = sorted({symbol_parts(key)[0] for key in poses})
-    if len(there) > 1:  # only the factors tell what is a mount
-        poses -= set(mounts_of(joined.graph().batch).tolist())
+    if len(there) > 1:  # only the factors tell what is no place
+        poses -= set(poses_aside(joined.graph().batch).tolist())
         there = sorted({symbol_parts(key)[0] for key in poses})
     if robot is None:
         return there

@@ -20,6 +20,6 @@ U8 = NDArray[np.uint8]
 
 _KERNELS = Path(jit.__file__).parents[1]
 _BORROWED = ("model/layout", "model/records", "graph/group_table", "jit/array_table", "jit/records")
-_ALSO = (*(_KERNELS / f"{name}.py" for name in _BORROWED), WIRE_KINDS)
+_ALSO = (*(_KERNELS / f"{name}.py" for name in _BORROWED), *WIRE_KINDS)
 _FOLDER = KernelFolder(Path(__file__).parent, "kernels-wire", quick=True, also=_ALSO)
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

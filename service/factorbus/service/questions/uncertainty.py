@@ -29,7 +29,7 @@ from factorbus.solver.covariance.square_root import SquareRoot
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.errors import UnknownVariable
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factor_rows import mount_variables
+from factorbus.solver.graph.factor_rows import variables_aside
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 from factorbus.solver.kernels.model import layout as at
 
@@ -252,12 +252,12 @@ class Uncertain:
         return found
 
     def _last_pose(self) -> I64:
-        """The newest that is no mount of a sensor.  Raises NoPose."""
+        """The newest that is in the map: no mount of a sensor, no other frame.  Raises NoPose."""
         poses = [VARIABLE_KINDS[name].code for name in ("se2", "se3")]
         kinds, counts = self._graph.var[: self._blocks.factored.count, at.V_KIND], self._graph.counts
-        mounts = mount_variables(self._graph.fac[: counts[at.FACTORS]]).tolist() if counts[at.MEMBERS] else ()
+        aside = variables_aside(self._graph.fac[: counts[at.FACTORS]]).tolist()
         for v in range(kinds.size - 1, -1, -1):
-            if kinds[v] in poses and v not in mounts:
+            if kinds[v] in poses and v not in aside:
                 return np.array([v])
         raise NoPose
 

@@ -6,10 +6,10 @@ A pose that was placed moved by M = x' x⁻¹, and what hangs on it moves by the
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factor_rows import is_first, rows_of_factors
+from factorbus.solver.graph.factor_rows import rows_of_factors
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.kinds import VECTOR
+from factorbus.solver.kernels.model.kinds import JOINS_PLACES, OF_FAMILY, VECTOR
 from factorbus.solver.starts.relations import poses_apart
 from factorbus.solver.starts.rotation_matrices import quaternions_of, turned_rays
 
@@ -26,8 +26,8 @@ def carry_along(graph: FactorGraph, values: F64, placed: np.ndarray, stays: np.n
     values, kind = values.copy(), graph.var[: placed.size, at.V_KIND]
     known = (placed | (graph.var[: placed.size, at.V_COLUMN] < 0)) & stays
     fac = graph.fac[: kept.size]
-    joins = is_first(fac)  # of a sensor with a mount the first two variables: the mount is not in the map
-    joins[rows_of_factors(fac, np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR))] = True
+    joins = JOINS_PLACES[fac[:, at.F_KIND]]  # the first two variables: a mount, say, is not in the map
+    joins[rows_of_factors(fac, np.flatnonzero(OF_FAMILY[fac[:, at.F_KIND]]))] = True
     ends = fac[kept & (fac[:, at.F_J] >= 0) & joins][:, [at.F_I, at.F_J]]
     ends = ends[~VECTOR[kind[ends]].any(axis=1)]
     ends = np.concatenate([ends, ends[:, ::-1]])  # (from, to)

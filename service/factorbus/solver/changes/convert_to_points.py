@@ -57,9 +57,9 @@ def pick_features(graph: FactorGraph, keys: I64) -> I64:
 
 
 def has_linear_factor(graph: FactorGraph) -> np.ndarray:
-    """Which variables (n,) a linear factor is on: a feature that has one stays what that is of."""
+    """Which variables (n,) a linear factor, or one of an own kind, is on: such a feature stays what that is of."""
     fac, marked = graph.fac[: graph.counts[at.FACTORS]], np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
-    linear = np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR)
+    linear = np.flatnonzero(np.isin(fac[:, at.F_KIND], (at.LINEAR, at.OWN)))
     marked[fac[rows_of_factors(fac, linear), at.F_I : at.F_J + 1]] = True
     return marked[:-1]
 
@@ -88,7 +88,7 @@ def with_points(graph: FactorGraph, features: I64) -> FactorGraph:
     made.counts[at.MEMBERS] = graph.counts[at.MEMBERS]
     made.counts[[at.PAYLOAD, at.COLUMNS, at.SCALARS]] = payload.size, np.count_nonzero(free), dims[free].sum()
     made.stamps, made.counts[at.STAMPED] = graph.stamps[:variables].copy(), graph.counts[at.STAMPED]
-    made.ids, made.id_shift = graph.ids, graph.id_shift
+    made.ids, made.id_shift, made.own = graph.ids, graph.id_shift, graph.own
     return made
 
 

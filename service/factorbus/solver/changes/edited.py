@@ -34,6 +34,7 @@ def edited(graph: FactorGraph, edits: Edits) -> FactorGraph:
     made.counts[at.MEMBERS] = np.count_nonzero(~is_first(made.fac))
     made.counts[at.STAMPED] = np.count_nonzero(made.stamps != at.NO_STAMP)
     made.name_factors(graph.ids_of(kept), graph.next_id)
+    made.own = graph.own
     return made
 
 

@@ -176,7 +176,7 @@ class FactorEdit:
         graph, edits = self._graph, self._edits
         kind, start = graph.kind_of(row), int(graph.fac[row, at.F_AT])
         loss = int(edits.loss[row])
-        had, width = bool(losses_of(graph.fac[row]) != at.NO_LOSS), kind.size + kind.triangle
+        had, width = bool(losses_of(graph.fac[row]) != at.NO_LOSS), kind.width
         if loss != at.NO_LOSS and not had:
             graph.reserve_factors(1, width + 1)
             end = int(graph.counts[at.PAYLOAD])
@@ -190,7 +190,7 @@ class FactorEdit:
         if loss != at.NO_LOSS:
             graph.payload[start + width] = edits.scale[row]
         if edits.weight[row] != 1.0:
-            graph.payload[start + kind.size : start + width] *= edits.weight[row]
+            graph.payload[start + kind.information_at : start + width] *= edits.weight[row]
         graph.fac[row, at.F_FLAGS] = with_losses(graph.fac[row, at.F_FLAGS], loss)
 
     def _widths(self, rows: I64) -> I64:

@@ -28,6 +28,7 @@ from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
+from factorbus.solver.kernels.model.kinds import JOINS_PLACES, OF_FAMILY
 from factorbus.solver.optimize.gauss_newton import StoppingRule, minimize
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
@@ -89,7 +90,8 @@ def repair(graph: FactorGraph, factors: I64 | None = None, probability: float = 
 def find_loops(graph: FactorGraph) -> I64:
     """Rows of the factors between variables that factors before them, or being fixed, join already.
 
-    Linear factors of more than two variables, which marginals are, join, and are no suspects.
+    Linear factors of more than two variables, which marginals are, inertial ones, and own kinds of more, join, and are
+    no suspects.
     """
     count = int(graph.counts[at.VARIABLES])
     above = list(range(count + 1))
@@ -97,11 +99,11 @@ def find_loops(graph: FactorGraph) -> I64:
         above[v] = count  # the ground
     loops = []
     fac = graph.fac[: graph.counts[at.FACTORS]]
-    for f in np.flatnonzero(is_first(fac)).tolist():  # the first row of three variables is without the mount
+    for f in np.flatnonzero(is_first(fac)).tolist():  # its first row is without a mount, a bias, and the like
         i, j = fac[f, at.F_I : at.F_J + 1].tolist()
-        if j < 0:
+        if j < 0 or not JOINS_PLACES[fac[f, at.F_KIND]]:
             continue
-        if fac[f, at.F_KIND] == at.LINEAR and len(ends := graph.ends_of(f)) > 2:
+        if OF_FAMILY[fac[f, at.F_KIND]] and len(ends := graph.ends_of(f)) > 2:
             for v in ends[1:]:
                 _join(above, ends[0], v)
         elif not _join(above, i, j):

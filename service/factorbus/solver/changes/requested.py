@@ -192,7 +192,7 @@ def _weigh(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
 def _check_weighed(graph: FactorGraph, edits: Edits, rows: I64) -> None:
     """Is Ω of these factors still within its bounds?  Raises BadWeight."""
     for kind, of in graph.kinds_of(rows):
-        omega = np.abs(graph.payload[graph.fac[of, at.F_AT, None] + kind.size + np.arange(kind.triangle)])
+        omega = np.abs(graph.payload[graph.fac[of, at.F_AT, None] + kind.information_at + np.arange(kind.triangle)])
         diagonal = omega[:, np.cumsum([0, *range(kind.dim, 1, -1)])]
         least, most = LEAST_INFORMATION / diagonal.min(axis=1), MOST_INFORMATION / omega.max(axis=1)
         bad = np.flatnonzero(~((least <= edits.weight[of]) & (edits.weight[of] <= most)))

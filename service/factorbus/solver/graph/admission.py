@@ -6,11 +6,12 @@ in use; what concerns rows together is checked when all are there.
 
 import numpy as np
 
+from factorbus.proto import inertial
 from factorbus.solver import errors
-from factorbus.solver.graph import observations
+from factorbus.solver.graph import observations, own_kinds
 from factorbus.solver.graph.columns import Columns, floats_at, ints_at, limit_lenses, locate_columns
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, linear_of
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, imu_of, kinds_by_id, linear_of
 from factorbus.solver.graph.groups import BatchLike
 from factorbus.solver.graph.triangulation import place_by_bearings
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -27,6 +28,7 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     find_first_outside,
 )
+from factorbus.solver.kernels.model.expression_layout import X_ID
 
 _NEAR = "choose units and an origin near the data"
 
@@ -40,7 +42,10 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns) -> int:
     """
     raw, groups, problem = (batch.raw, batch.groups, None) if isinstance(batch, Columns) else locate_columns(batch)
     mark, first = graph.mark(), graph.next_id
+    own = graph.own
     try:
+        if not isinstance(batch, Columns) and groups[:, gt.G_LENGTH].any():
+            own_kinds.take_own_kinds(graph, batch)
         fault, g, row, rest = admit_groups(raw, groups, graph.array_table)
         if fault == gt.NO_LIMITS:
             raw, groups, lens = limit_lenses(raw, groups)
@@ -60,6 +65,7 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns) -> int:
             _finish(graph, groups, mark, rest)
     except BaseException:
         graph.forget(mark)
+        graph.own = own
         raise
     return first
 
@@ -70,6 +76,8 @@ def _finish(graph: FactorGraph, groups: I64, mark: Mark, rest: int) -> None:
         _compose(graph, mark[at.VARIABLES], mark[at.FACTORS], _list_given(groups))
     if rest & gt.OBSERVED:
         observations.check(graph, mark[at.FACTORS])
+    if rest & gt.OWN:
+        own_kinds.check_residuals(graph, mark[at.FACTORS])
 
 
 def _list_given(groups: I64) -> I64:
@@ -117,7 +125,7 @@ def _find_bad_row(graph: FactorGraph, raw: bytes, group: I64, n: int, fault: int
         kind = VARIABLE_KIND_OF_CODE[code]
         value = floats_at(raw, numbers + 8 * n * kind.size, kind.size) if numbers != gt.NOWHERE else None
         return _bad_variable(kind.name, fault, int(ints_at(raw, keys + 8 * n, 1)[0]), value)
-    kind, loss = _kind_of(raw, group), int(group[gt.G_LOSS])
+    kind, loss = _kind_of(graph, raw, group), int(group[gt.G_LOSS])
     if fault == gt.BAD_SCALE:
         scale = floats_at(raw, int(group[gt.G_SCALE]) + 8 * n, 1)[0]
         wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
@@ -128,10 +136,15 @@ def _find_bad_row(graph: FactorGraph, raw: bytes, group: I64, n: int, fault: int
     return _bad_factor(graph, kind, fault, ints_at(raw, keys + 8 * n * arity, arity), measured, information)
 
 
-def _kind_of(raw: bytes, group: I64) -> FactorKind:
+def _kind_of(graph: FactorGraph, raw: bytes, group: I64) -> FactorKind:
     """The kind of a group of factors."""
-    if group[gt.G_KIND] != at.LINEAR:
-        return FACTOR_KIND_OF_CODE[int(group[gt.G_KIND])]
+    if (code := int(group[gt.G_KIND])) < at.LINEAR:
+        return FACTOR_KIND_OF_CODE[code]
+    if code == at.OWN:
+        own = floats_at(raw, int(group[gt.G_INSTRUCTIONS]), int(group[gt.G_LENGTH]))
+        return kinds_by_id(graph.own)[int(own[X_ID])]
+    if code == at.IMU:
+        return imu_of((int(group[gt.G_SIZE]) - inertial.SAMPLES) // inertial.SAMPLE)
     ends = ints_at(raw, int(group[gt.G_ENDS]), int(group[gt.G_ARITY]))
     return linear_of(int(group[gt.G_ROWS]), tuple(ends.tolist()))
 
@@ -165,11 +178,27 @@ def _bad_factor(
         return errors.BadRange(where, float(measured[min(1, kind.size - 1)]))
     if wrong == gt.BAD_DIRECTION:
         return errors.BadDirection(where)
+    if wrong == gt.BAD_DURATION:
+        durations = measured[inertial.SAMPLES :: inertial.SAMPLE]
+        sample = int(np.flatnonzero(~(durations > 0.0))[0])
+        return errors.BadSamples(where, f"sample {sample} lasts {durations[sample]:g} s", "more than 0 s")
+    if wrong == gt.BAD_NOISE:
+        return _bad_noise(where, measured)
     if wrong == gt.NOT_POSITIVE_DEFINITE:
         matrix = np.zeros((kind.dim, kind.dim))
         matrix[np.triu_indices(kind.dim)] = information
         return errors.NotPositiveDefinite(where, float(np.linalg.eigvalsh(matrix, UPLO="U")[0]))
     return _number_out_of_bounds(kind, where, measured, information)
+
+
+def _bad_noise(where: str, measured: F64) -> errors.SolverError:
+    """A noise density is not positive, or the covariance of Δ is singular, as that of one sample is."""
+    noise = measured[: inertial.GRAVITY]
+    if (noise[: inertial.INTEGRATION] > 0.0).all() and noise[inertial.INTEGRATION] >= 0.0:
+        seen = f"the covariance of Δ is singular with noise of integration {noise[inertial.INTEGRATION]:g} m/√s"
+        return errors.BadSamples(where, seen, "a larger one, 1e-4 say, or more samples")
+    seen = ", ".join(f"{number:g}" for number in noise.tolist())
+    return errors.BadSamples(where, f"noise densities {seen}", "all above 0, and the last, of integration, 0 or more")
 
 
 def _worst_norm(kind: FactorKind, measured: F64) -> float:
@@ -180,6 +209,8 @@ def _worst_norm(kind: FactorKind, measured: F64) -> float:
         for end in kind.connects:
             starts += [here + 3] if end.name == "se3" else []
             here += end.size
+    if kind.own:
+        starts = [{"so3": 0}.get(str(kind.own.measured), 3)]
     norms = [float(np.linalg.norm(measured[start : start + 4])) for start in starts]
     return max(norms, key=lambda norm: abs(norm - 1.0))
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy import ndarray
 
+from factorbus.proto import inertial
 from factorbus.proto.kinds import FACTOR_KINDS as WIRE_KINDS
 from factorbus.solver import errors
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS, LENS_AT, LOSSES
@@ -25,7 +26,8 @@ _I64, _F64 = np.dtype("<i8"), np.dtype("<f8")
 _END = (gt.END,) + (0,) * (gt.G_WIDTH - 1)
 _WORD = 8
 _ABSENT = (None, ())  # the form of a column that is not there
-_NOT_LINEAR = (0, 0, 0, gt.NOWHERE)  # the last columns of a group that is not of linear factors
+_NO_SIZES = (0, 0, 0, gt.NOWHERE, gt.NOWHERE, 0)  # the last columns of a group whose kind says what its sizes are
+_SIZED = "linear_", inertial.PREFIX  # what the names of the others begin with, but for formulas
 
 
 class Columns(NamedTuple):
@@ -53,8 +55,8 @@ def locate_columns(batch: BatchLike) -> tuple[bytes, I64, errors.SolverError | N
     for group in batch.factors:
         keys, measured, information = group.keys, group.measured, group.information
         columns += (keys, measured, information)
-        if group.kind.startswith("linear_") and group.kind in WIRE_KINDS:
-            columns.append(_codes_of_ends(group.kind))
+        if group.kind.startswith(_SIZED) or "(" in group.kind:
+            columns += _columns_of_kind(group.kind)
         form += (group.kind, group.loss)
         if type(keys) is type(measured) is type(information) is ndarray:
             form += (keys.dtype, keys.shape), (measured.dtype, measured.shape), (information.dtype, information.shape)
@@ -135,8 +137,8 @@ def _table_before(variables: int, form: tuple[Any, ...]) -> I64:
 
 def _count_columns(groups: I64) -> int:
     """How many columns the groups have."""
-    columns = groups[:-1, [gt.G_KEYS, gt.G_NUMBERS, gt.G_INFORMATION, gt.G_SCALE, gt.G_STAMPS, gt.G_ENDS]]
-    return int(np.count_nonzero(columns != gt.NOWHERE))
+    places = [gt.G_KEYS, gt.G_NUMBERS, gt.G_INFORMATION, gt.G_SCALE, gt.G_STAMPS, gt.G_ENDS, gt.G_INSTRUCTIONS]
+    return int(np.count_nonzero(groups[:-1, places] != gt.NOWHERE))
 
 
 def _iter_rows(variables: int, form: tuple[Any, ...]) -> Iterator[tuple[int, ...]]:
@@ -157,7 +159,7 @@ def _iter_rows(variables: int, form: tuple[Any, ...]) -> Iterator[tuple[int, ...
             _check(stamps, _I64, (count,), name, "stamps")
             at_stamps, here = here, here + _WORD * count
         places = at_keys, at_values, gt.NOWHERE, gt.NOWHERE, at_stamps
-        yield kind.code, 0, count, bool(fixed), at.NO_LOSS, *places, 0, *_NOT_LINEAR
+        yield kind.code, 0, count, bool(fixed), at.NO_LOSS, *places, 0, *_NO_SIZES
     for k in range(variables, len(form), 6):
         name, loss, keys, measured, information, scale = form[k : k + 6]
         kind = FACTOR_KINDS.get(name)
@@ -170,20 +172,26 @@ def _iter_rows(variables: int, form: tuple[Any, ...]) -> Iterator[tuple[int, ...
         at_keys, at_measured = here, here + _WORD * count * len(kind.connects)
         at_information = at_measured + _WORD * count * kind.size
         here = at_information + _WORD * count * kind.triangle
-        at_scale, linear = gt.NOWHERE, _NOT_LINEAR
-        if kind.code == at.LINEAR:
-            linear, here = (len(kind.connects), kind.dim, kind.size, here), here + _WORD * len(kind.connects)
+        at_scale, sizes = gt.NOWHERE, _NO_SIZES
+        if kind.code >= at.LINEAR:
+            before, ends = here + _WORD * len(kind.connects), len(kind.connects)
+            sizes = ends, kind.dim, kind.size, here, before if kind.before else gt.NOWHERE, kind.before
+            here = before + _WORD * kind.before
         if loss:
             _check_loss(name, loss, scale, count)
             at_scale, here = here, here + _WORD * count
         places = at_keys, at_measured, at_information, at_scale, gt.NOWHERE
-        yield kind.code, 1, count, 0, LOSSES[loss] if loss else at.NO_LOSS, *places, 0, *linear
+        yield kind.code, 1, count, 0, LOSSES[loss] if loss else at.NO_LOSS, *places, 0, *sizes
 
 
 @lru_cache(maxsize=1024)
-def _codes_of_ends(kind: str) -> bytes:
-    """The codes of the kinds of the variables of linear factors."""
-    return np.array([end.code for end in FACTOR_KINDS[kind].connects], _I64).tobytes()
+def _columns_of_kind(name: str) -> tuple[bytes, ...]:
+    """Of a kind of a family: the codes of the kinds of the variables, and of an own one instructions."""
+    kind = FACTOR_KINDS.get(name)
+    if kind is None:
+        return ()
+    ends = np.array([end.code for end in kind.connects], _I64).tobytes()
+    return (ends, kind.instructions.astype(_F64).tobytes()) if kind.before else (ends,)
 
 
 def _check_loss(kind: str, loss: str, scale: tuple[Any, Any], count: int) -> None:

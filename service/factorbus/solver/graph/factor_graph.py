@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from factorbus.proto import inertial
 from factorbus.solver.errors import printed
 from factorbus.solver.graph.arenas import Arenas, lines
 from factorbus.solver.graph.factor_rows import (
@@ -22,7 +23,7 @@ from factorbus.solver.graph.factor_rows import (
     losses_of,
     rows_of_arities,
 )
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, linear_of
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, imu_of, kinds_by_id, linear_of
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.graph.rows import Rows, Span
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -31,15 +32,19 @@ from factorbus.solver.kernels.graph.key_table import enter_keys, find_variable, 
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
-from factorbus.solver.kernels.model.kinds import CAMERA
+from factorbus.solver.kernels.model.expression_layout import X_ID
+from factorbus.solver.kernels.model.kinds import CAMERA, OF_FAMILY
 from factorbus.solver.kernels.model.retract import common_label, gather_values
 
 Mark: TypeAlias = tuple[int, ...]
 
 _MUCH = 4096  # rows
-# By the code of a kind; the last two are of linear factors, whose sizes are their own, and of members.
-_MEASURED = np.array([*(FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)), 0, 0], np.int64)
-_TRIANGLE = np.array([*(FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)), 0, 0], np.int64)
+# By the code of a kind; the last are of members, and of families, whose sizes are each factor's own.
+_NO_SIZE = (0,) * at.FURTHER_CODES
+_MEASURED = np.array([*(FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)), *_NO_SIZE], np.int64)
+_TRIANGLE = np.array(
+    [*(FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)), *_NO_SIZE], np.int64
+)
 _NO_KEYS: I64 = np.empty(0, np.int64)
 
 
@@ -67,6 +72,7 @@ class FactorGraph(Arenas):
         self._id_room: I64 = np.empty(0, np.int64)  # where ids are listed that grow with every insert
         self._unlisted: tuple[I64, int] | None = None  # both as they were before factors had several rows
         self.holes = 0  # numbers of the payload that no factor has any more
+        self.own: tuple[str, ...] = ()  # the own kinds of its factors: their formulas, each once
         self._rows = Rows()
 
     @property
@@ -98,6 +104,7 @@ class FactorGraph(Arenas):
         other.values, other.payload = self.values[:values].copy(), self.payload[:payload].copy()
         other.fac = self.fac[:factors].copy()
         other.ids, other.id_shift, other.holes = self.ids.copy(), self.id_shift, self.holes
+        other.own = self.own
         return other
 
     def make_room(self, groups: I64) -> None:
@@ -250,8 +257,12 @@ class FactorGraph(Arenas):
     def kind_of(self, row: int) -> FactorKind:
         """The kind of the factor that begins at a row."""
         code, flags = (int(n) for n in self.fac[row, [at.F_KIND, at.F_FLAGS]])
-        if code != at.LINEAR:
+        if code < at.LINEAR:
             return FACTOR_KIND_OF_CODE[code]
+        if code == at.OWN:
+            return kinds_by_id(self.own)[int(self.payload[self.fac[row, at.F_AT] + X_ID])]
+        if code == at.IMU:
+            return imu_of(flags >> at.SAMPLES_SHIFT & at.SAMPLES_MASK)
         return linear_of(flags >> at.DIM_SHIFT, tuple(self.var[self.ends_of(row), at.V_KIND].tolist()))
 
     def kinds_of(self, rows: I64) -> list[tuple[FactorKind, I64]]:
@@ -259,22 +270,22 @@ class FactorGraph(Arenas):
         codes, found = self.fac[rows, at.F_KIND], list[tuple[FactorKind, I64]]()
         for code in np.flatnonzero(np.bincount(codes)).tolist() if rows.size else ():
             of = rows[codes == code]
-            if code != at.LINEAR:
+            if code < at.LINEAR:
                 found.append((FACTOR_KIND_OF_CODE[code], of))
                 continue
-            linear: dict[FactorKind, list[int]] = {}
+            kinds: dict[FactorKind, list[int]] = {}
             for row in of.tolist():
-                linear.setdefault(self.kind_of(row), []).append(row)
-            found += [(kind, np.array(of_kind)) for kind, of_kind in linear.items()]
+                kinds.setdefault(self.kind_of(row), []).append(row)
+            found += [(kind, np.array(of_kind)) for kind, of_kind in kinds.items()]
         return found
 
     def sizes_of(self, rows: I64) -> tuple[I64, I64]:
-        """(numbers measured, numbers of the information) of each of these rows; none of those that begin no factor."""
+        """(numbers before the information, numbers of it) of each of these rows; none of those that begin no factor."""
         fac = self.fac[rows]
         measured, triangle = _MEASURED[fac[:, at.F_KIND]], _TRIANGLE[fac[:, at.F_KIND]]
-        for k in np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR).tolist():
+        for k in np.flatnonzero(OF_FAMILY[fac[:, at.F_KIND]]).tolist():
             kind = self.kind_of(int(rows[k]))
-            measured[k], triangle[k] = kind.size, kind.triangle
+            measured[k], triangle[k] = kind.information_at, kind.triangle
         return measured, triangle
 
     def factors(self, most: int | None = None) -> list[FactorGroup]:
@@ -294,7 +305,8 @@ class FactorGraph(Arenas):
         ends = self.keys[ends_of_rows(fac, rows, len(kind.connects))]
         width = kind.width + (1 if loss else 0)
         numbers = self.payload[picked[:, at.F_AT, None] + np.arange(width)]
-        measured, information, scale = np.hsplit(numbers, [kind.size, kind.width])
+        numbers = np.hsplit(numbers, [kind.before, kind.before + kind.size, kind.information_at, kind.width])
+        _, measured, _, information, scale = numbers
         own = scale[:, 0].copy() if loss else None
         return FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own, self.ids_of(rows))
 
@@ -329,11 +341,12 @@ class FactorGraph(Arenas):
 
 
 def _shape(group: I64) -> tuple[int, int]:
-    """(variables, numbers of a measurement and its information) of each factor of a group."""
-    if group[gt.G_KIND] == at.LINEAR:
-        rows = int(group[gt.G_ROWS])
-        return int(group[gt.G_ARITY]), int(group[gt.G_SIZE]) + rows * (rows + 1) // 2
-    kind = FACTOR_KIND_OF_CODE[int(group[gt.G_KIND])]
+    """(variables, numbers without the scale of a loss) of each factor of a group."""
+    if (code := int(group[gt.G_KIND])) >= at.LINEAR:
+        rows, kept = int(group[gt.G_ROWS]), inertial.KEPT if code == at.IMU else 0
+        before = int(group[gt.G_LENGTH]) + int(group[gt.G_SIZE]) + kept
+        return int(group[gt.G_ARITY]), before + rows * (rows + 1) // 2
+    kind = FACTOR_KIND_OF_CODE[code]
     return len(kind.connects), kind.width
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import ASIDE_END
 
 _LOSS = at.LOSS_MASK << at.LOSS_SHIFT
 
@@ -66,11 +67,13 @@ def arities_of(fac: I64) -> I64:
 
 
 def are_of_many(fac: I64) -> np.ndarray:
-    """Which rows (n,) are of factors that `many` evaluates: of more than two variables, or linear ones."""
+    """Which rows (n,) are of factors that `many` evaluates: of more than two, linear, or own."""
     return fac[:, at.F_FLAGS] >> at.OFFSET_SHIFT != 0
 
 
-def mount_variables(fac: I64) -> I64:
-    """The variables that are mounts of sensors: the last of each factor of three that is no linear one."""
-    of_three = fac[:, at.F_FLAGS] >> at.ENDS_SHIFT & at.ENDS_MASK == 3
-    return np.unique(fac[np.flatnonzero(of_three & (fac[:, at.F_KIND] != at.LINEAR)) + 1, at.F_J])
+def variables_aside(fac: I64) -> I64:
+    """The poses that are no places in the map: mounts of sensors, and the map's poses in other frames."""
+    end = ASIDE_END[fac[:, at.F_KIND]]
+    rows = np.flatnonzero(end >= 0)
+    end = end[rows]
+    return np.unique(np.where(end == 0, fac[rows, at.F_I], fac[rows + np.maximum(end - 1, 0), at.F_J]))

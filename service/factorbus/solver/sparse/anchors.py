@@ -17,6 +17,7 @@ from factorbus.solver.kernels.graph.initialize import join, reach
 from factorbus.solver.kernels.graph.observability import mark_determined
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import ABSOLUTE, OF_FAMILY
 from factorbus.solver.sparse.blocks import HessianBlocks
 
 # A variance this many times what the variable's own factors alone would leave is no longer a number.
@@ -43,11 +44,11 @@ def find_undetermined(graph: FactorGraph, since: Mark) -> I64:
 
 
 def _mark_together(graph: FactorGraph, since: Mark, determined: I64) -> bool:
-    """Set to 1 in `determined` what one linear factor determines with several variables together, as a marginal of the
-    map's anchor does; gives whether there is any."""
+    """Set to 1 in `determined` what one linear factor, or one of an own kind, determines with several variables
+    together, as a marginal of the map's anchor does, or an inertial one; gives whether there is any."""
     first, found = since[at.VARIABLES], False
     fac = graph.fac[since[at.FACTORS] : graph.counts[at.FACTORS]]
-    for row in (since[at.FACTORS] + np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR)).tolist():
+    for row in (since[at.FACTORS] + np.flatnonzero(OF_FAMILY[fac[:, at.F_KIND]])).tolist():
         loose = [v for v in graph.ends_of(row) if v >= first and not determined[v - first]]
         scalars = int(graph.dims[graph.var[loose, at.V_COLUMN]].sum())
         if len(loose) > 1 and graph.kind_of(row).dim >= scalars:
@@ -63,14 +64,15 @@ def _mark_together(graph: FactorGraph, since: Mark, determined: I64) -> bool:
 def find_unanchored(graph: FactorGraph, since: Mark) -> int:
     """A variable after `since` that no factors join, however indirectly, to one that is fixed or has a prior; or −1.
 
-    A linear factor may say where its variables are in the map: the numbers tell.
+    A linear factor, or one of an own kind, may say where its variables are in the map: the numbers tell.
     """
     first, last = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
     factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
     anchored = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
     fac = graph.fac[factors[0] : factors[1]]
-    linear = rows_of_factors(fac, np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR))
-    anchors = np.concatenate([fac[fac[:, at.F_J] < 0, at.F_I], fac[linear, at.F_I], fac[linear, at.F_J]])
+    linear = rows_of_factors(fac, np.flatnonzero(np.isin(fac[:, at.F_KIND], (at.LINEAR, at.OWN))))
+    told = (fac[:, at.F_J] < 0) | ABSOLUTE[fac[:, at.F_KIND]]
+    anchors = np.concatenate([fac[told, at.F_I], fac[linear, at.F_I], fac[linear, at.F_J]])
     anchored[anchors[anchors >= first] - first] = 1
     return int(join(first, last, *factors, graph.fac, anchored, np.empty(last - first + 1, np.int64)))
 

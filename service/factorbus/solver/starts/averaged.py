@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factor_rows import mount_variables
+from factorbus.solver.graph.factor_rows import variables_aside
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.carried import carry, tied
@@ -123,7 +123,7 @@ def _nodes(graph: FactorGraph, space: PoseSpace) -> Nodes:
     )
     R[pose], t[pose] = poses_apart(graph.values[var[pose[1:], at.V_AT, None] + np.arange(size)])
     t[point] = graph.values[var[point[1:], at.V_AT, None] + np.arange(d)]
-    fixed[1 + mount_variables(graph.fac[: graph.counts[at.FACTORS]])] = True  # not in the map: as they are
+    fixed[1 + variables_aside(graph.fac[: graph.counts[at.FACTORS]])] = True  # not in the map: as they are
     pose[0] = fixed[0] = True
     return Nodes(R, t, pose, point, fixed)
 

@@ -32,15 +32,16 @@ class PoseSpace:
     position: int
     bearing: int
     between_mount: int
+    between_scale: int
 
 
 PLANE = PoseSpace(
     2, at.SE2, at.POINT2, at.PRIOR_SE2, at.PRIOR_POINT2, at.BETWEEN_SE2, at.LANDMARK_SE2, at.POSITION_SE2,
-    at.BEARING_SE2, at.FACTOR_CODES["between_se2_mount"],
+    at.BEARING_SE2, at.FACTOR_CODES["between_se2_mount"], at.FACTOR_CODES["between_se2_scale"],
 )  # fmt: skip
 SPACE = PoseSpace(
     3, at.SE3, at.POINT3, at.PRIOR_SE3, at.PRIOR_POINT3, at.BETWEEN_SE3, at.LANDMARK_SE3, at.POSITION_SE3,
-    at.BEARING_SE3, at.FACTOR_CODES["between_se3_mount"],
+    at.BEARING_SE3, at.FACTOR_CODES["between_se3_mount"], at.FACTOR_CODES["between_se3_scale"],
 )  # fmt: skip
 
 
@@ -110,7 +111,7 @@ def relations_of(graph: FactorGraph, space: PoseSpace) -> tuple[Relations, Direc
 
 
 def _parts(graph: FactorGraph, space: PoseSpace) -> list[tuple[np.ndarray, ...]]:
-    parts = [_poses(graph, space, space.between), _poses(graph, space, space.prior)]
+    parts = [_poses(graph, space, kind) for kind in (space.between, space.between_scale, space.prior)]
     parts += [_points(graph, space, space.landmark), _points(graph, space, space.prior_point)]
     parts += [_between_sensors(graph, space), _positions(graph, space), _bearings(graph, space)]
     parts += [_linear(graph, space, rows) for rows in _linear_factors(graph, space)]
@@ -171,8 +172,10 @@ def poses_apart(numbers: F64) -> tuple[F64, F64]:
 def _poses(graph: FactorGraph, space: PoseSpace, kind: int) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, kind)
     (R, t), d = poses_apart(measured), space.dim
-    b = fac[:, at.F_J] + 1 if kind == space.between else fac[:, at.F_I] + 1
-    a = fac[:, at.F_I] + 1 if kind == space.between else np.zeros(rows.size, np.int64)
+    b = fac[:, at.F_I if kind == space.prior else at.F_J] + 1
+    a = np.zeros(rows.size, np.int64) if kind == space.prior else fac[:, at.F_I] + 1
+    if kind == space.between_scale:  # the scale as it is now
+        t = t * _value(graph, graph.fac[rows + 1, at.F_J], 1)
     t_information = R @ information[:, :d, :d] @ R.transpose(0, 2, 1)
     turn, couple = _turn(information, d), R @ information[:, :d, d:]
     return _made(graph, rows, fac, a, b, t, t_information, R=R, turn=turn, couple=couple)

@@ -19,6 +19,6 @@ _BORROWED = (
     *("jit/simd", "jit/simd_llvm", "jit/simd_checked", "jit/simd_plain"),
 )
 _FOLDER = KernelFolder(
-    Path(__file__).parent, "kernels-covariance", also=(*(_KERNELS / f"{name}.py" for name in _BORROWED), WIRE_KINDS)
+    Path(__file__).parent, "kernels-covariance", also=(*(_KERNELS / f"{name}.py" for name in _BORROWED), *WIRE_KINDS)
 )
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

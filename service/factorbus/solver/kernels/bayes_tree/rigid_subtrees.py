@@ -42,7 +42,7 @@ def is_invariant(f: int, var: I64, fac: I64) -> bool:
     kind, j = fac[f, at.F_KIND], fac[f, at.F_J]
     if j < 0 or var[j, at.V_COLUMN] < 0 or var[fac[f, at.F_I], at.V_COLUMN] < 0:
         return False
-    return is_rigid(kind)
+    return is_rigid(kind) or fac[f, at.F_FLAGS] & at.RIGID != 0
 
 
 @part

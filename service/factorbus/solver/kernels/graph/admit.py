@@ -6,11 +6,14 @@ before it are in the graph then, for the function that names the fault, and the 
 
 import numpy as np
 
+from factorbus.proto import inertial
 from factorbus.solver.kernels.graph import group_table as gt
 from factorbus.solver.kernels.graph.check_rows import (
+    check_imu,
     check_information,
     check_linear,
     check_measurement,
+    check_own_measurement,
     check_value,
 )
 from factorbus.solver.kernels.graph.initialize import reach
@@ -18,12 +21,14 @@ from factorbus.solver.kernels.graph.key_table import slot_of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find_outside
+from factorbus.solver.kernels.model.expression_layout import X_RIGID
 from factorbus.solver.kernels.model.factor_rows import row_of_pair, rows_of_arity
-from factorbus.solver.kernels.model.kinds import is_camera
+from factorbus.solver.kernels.model.kinds import base_kind, is_camera
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import (
     arity_of,
     dim_of,
+    has_own_sizes,
     information_at,
     kind_of_end,
     kinds_of_ends,
@@ -83,8 +88,11 @@ def check_room(groups: I64, graph: Graph) -> int:
             variables, numbers = variables + count, numbers + count * size_of(kind)
         else:
             arity, dim, size = shape_of(groups[g])
+            size += groups[g, gt.G_LENGTH]
             factors += count * rows_of_arity(arity)
-            measured += count * (size + dim * (dim + 1) // 2 + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0))
+            measured += count * (
+                size + kept_of(kind) + dim * (dim + 1) // 2 + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0)
+            )
             if is_camera(kind) and groups[g, gt.G_LIMITED] == 0:
                 return gt.NO_LIMITS
         g += 1
@@ -124,9 +132,15 @@ def append_variables(raw: bytes, group: I64, graph: Graph) -> tuple:
 def shape_of(group: I64) -> tuple:
     """(variables, numbers of a residual, numbers measured) of each factor of a group."""
     kind = group[gt.G_KIND]
-    if kind == at.LINEAR:
+    if has_own_sizes(kind):
         return group[gt.G_ARITY], group[gt.G_ROWS], group[gt.G_SIZE]
     return arity_of(kind), residual_dim(kind), information_at(kind)
+
+
+@inline_kernel
+def kept_of(kind: int) -> int:
+    """Numbers that are kept behind the measurement of a kind, and follow from it."""
+    return inertial.KEPT if kind == at.IMU else 0
 
 
 @part
@@ -136,10 +150,12 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
     kind, loss, payload, counts = group[gt.G_KIND], group[gt.G_LOSS], graph.payload, graph.counts
     arity, dim, size = shape_of(group)
     triangle, ends, kinds = dim * (dim + 1) // 2, np.empty(arity, np.int64), np.empty(arity, np.int64)
+    has_ends = group[gt.G_ENDS] != gt.NOWHERE
     for n in range(arity):
-        kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if kind == at.LINEAR else kind_of_end(kind, n)
-    is_many, scratch = kind == at.LINEAR or arity > 2, np.empty((dim, dim))
-    rest = gt.OBSERVED if is_camera(kind) else 0
+        kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if has_ends else kind_of_end(kind, n)
+    is_many, scratch = has_ends or base_kind(kind) >= 0, np.empty((dim, dim))
+    rest, before = (gt.OBSERVED if is_camera(kind) else 0) | (gt.OWN if kind == at.OWN else 0), group[gt.G_LENGTH]
+    stored = before + size + kept_of(kind)
     for n in range(group[gt.G_COUNT]):
         p, first = counts[at.PAYLOAD], group[gt.G_KEYS] + 8 * n * arity
         i = j = -1
@@ -149,14 +165,15 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
             i, j, fault = find_ends(kind, int_at(raw, first), int_at(raw, first + 8 * (arity - 1)), graph)
         if fault != gt.GOOD:
             return n, fault, rest
-        copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p)
-        copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
-        fault = check_linear(kinds, p, size, payload) if kind == at.LINEAR else check_measurement(kind, p, payload)
+        copy_numbers(raw, group[gt.G_INSTRUCTIONS], before, payload, p)
+        copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p + before)
+        copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + stored)
+        fault = check_measured(kind, kinds, p, size, payload)
         if fault == gt.GOOD:
-            fault = check_information(dim, p + size, payload, scratch)
+            fault = check_information(dim, p + stored, payload, scratch)
         if fault != gt.GOOD:
             return n, fault, rest
-        numbers = size + triangle
+        numbers = stored + triangle
         if loss != at.NO_LOSS:
             scale = float_at(raw, group[gt.G_SCALE] + 8 * n)
             if not (scale >= LEAST_SCALE and scale <= MOST_NUMBER):
@@ -165,9 +182,28 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
             numbers += 1
         if is_many:
             append_factor_rows(kind, loss, dim, ends, numbers, graph)
+            if kind == at.IMU:
+                add_samples(size, len(ends), graph)
         else:
             append_factor(kind, loss, i, j, numbers, graph)
     return -1, gt.GOOD, rest
+
+
+@inline_kernel
+def check_measured(kind: int, kinds: I64, p: int, size: int, payload: F64) -> int:
+    """What is wrong with a new measurement of a kind; p: where its payload starts."""
+    if kind == at.LINEAR:
+        return check_linear(kinds, p, size, payload)
+    if kind == at.OWN:
+        return check_own_measurement(p, payload)
+    return check_imu(p, size, payload) if kind == at.IMU else check_measurement(kind, p, payload)
+
+
+@inline_kernel
+def add_samples(size: int, ends: int, graph: Graph) -> None:
+    """The newest factor is an inertial one with a measurement of that size."""
+    first = graph.counts[at.FACTORS] - rows_of_arity(ends)
+    graph.fac[first, at.F_FLAGS] |= (size - inertial.SAMPLES) // inertial.SAMPLE << at.SAMPLES_SHIFT
 
 
 @inline_kernel
@@ -244,6 +280,8 @@ def append_factor_rows(kind: int, loss: int, dim: int, ends: I64, numbers: int, 
             fac[f, at.F_FLAGS] = (f - first) << at.OFFSET_SHIFT
     fac[first, at.F_KIND], fac[first, at.F_AT] = kind, counts[at.PAYLOAD]
     fac[first, at.F_FLAGS] = dim << at.DIM_SHIFT | ends.size << at.ENDS_SHIFT | loss << at.LOSS_SHIFT
+    if kind == at.OWN and graph.payload[counts[at.PAYLOAD] + X_RIGID] != 0.0:
+        fac[first, at.F_FLAGS] |= at.RIGID
     counts[at.PAYLOAD] += numbers
     counts[at.FACTORS] += count
     counts[at.MEMBERS] += count - 1

@@ -5,6 +5,7 @@ The numbers are those that stand behind the ones in use, in the arenas of the gr
 
 import math
 
+from factorbus.proto import inertial
 from factorbus.solver.kernels.graph import group_table as gt
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
@@ -15,6 +16,8 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     are_within,
 )
+from factorbus.solver.kernels.model.expression_layout import X_BEFORE, X_LENGTH, X_QUATERNION
+from factorbus.solver.kernels.model.imu_noise import write_root
 from factorbus.solver.kernels.model.kinds import direction_at, positive_at, quaternion_at
 from factorbus.solver.kernels.model.se2 import wrap
 from factorbus.solver.kernels.model.sizes import information_at, size_of
@@ -51,6 +54,35 @@ def check_linear(kinds: I64, p: int, size: int, payload: F64) -> int:
             return gt.BAD_QUATERNION
         y += size_of(kinds[n])
     return gt.GOOD if are_within(MOST_LINEAR, y, p + size - y, payload) else gt.OUT_OF_BOUNDS
+
+
+@part
+def check_own_measurement(p: int, payload: F64) -> int:
+    """What is wrong with a new measurement of an own kind, whose payload starts at p."""
+    measured, end, turn = int(payload[p + X_LENGTH]), int(payload[p + X_BEFORE]), int(payload[p + X_QUATERNION])
+    if not are_within(MOST_NUMBER, p + measured, end - measured, payload):
+        return gt.OUT_OF_BOUNDS
+    if turn >= 0 and not normalize_quaternion(payload, p + measured + turn):
+        return gt.BAD_QUATERNION
+    return gt.GOOD
+
+
+@part
+def check_imu(p: int, size: int, payload: F64) -> int:
+    """What is wrong with a new inertial measurement of that size, which starts at p; W is written behind it."""
+    if not are_within(MOST_NUMBER, p, size, payload):
+        return gt.OUT_OF_BOUNDS
+    for n in range(inertial.INTEGRATION):
+        if not payload[p + n] > 0.0:
+            return gt.BAD_NOISE
+    if not payload[p + inertial.INTEGRATION] >= 0.0:
+        return gt.BAD_NOISE
+    for k in range(p + inertial.SAMPLES, p + size, inertial.SAMPLE):
+        if not payload[k] > 0.0:
+            return gt.BAD_DURATION
+    samples = (size - inertial.SAMPLES) // inertial.SAMPLE
+    is_certain = not write_root(samples, payload[p:], size, payload[p:])
+    return gt.BAD_NOISE if is_certain or not are_within(MOST_LINEAR, p + size, inertial.KEPT, payload) else gt.GOOD
 
 
 @part

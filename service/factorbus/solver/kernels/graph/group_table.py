@@ -16,11 +16,13 @@ G_INFORMATION = 7  # of the upper triangles of the information matrices
 G_SCALE = 8  # of the scales of the loss; NOWHERE: there is none
 G_STAMPS = 9  # of the time stamps of variables; NOWHERE: they have none
 G_LIMITED = 10  # 1: the lenses of what a camera saw have their limits
-G_ARITY = 11  # of linear factors, whose sizes are no other kind's: how many variables they have,
+G_ARITY = 11  # of linear, inertial and own kinds, whose sizes are no other kind's: how many variables they have,
 G_ROWS = 12  # numbers of a residual,
 G_SIZE = 13  # numbers measured of each factor,
 G_ENDS = 14  # and the offset of the codes of the kinds of their variables, as int64; of all others NOWHERE
-G_WIDTH = 15
+G_INSTRUCTIONS = 15  # of own kinds: the offset of what stands before the measurement, NOWHERE: it is none,
+G_LENGTH = 16  # and how many numbers that are
+G_WIDTH = 17
 
 END = -1
 NOWHERE = -1
@@ -39,6 +41,8 @@ BAD_RANGE = 9
 NOT_POSITIVE_DEFINITE = 10
 BAD_SCALE = 11
 BAD_DIRECTION = 12
+BAD_DURATION = 16  # a sample of an IMU that lasts no time
+BAD_NOISE = 17  # a sensor without noise, or whose noise leaves something certain
 
 # Of a factor that `many` evaluates: for each variable before the one that is wrong, to what is wrong of the first.
 LATER_END = 100
@@ -51,3 +55,4 @@ COMPOSED_OUT_OF_BOUNDS = 15  # a value that was composed; the row is the index o
 # Bits of what is left to be done for groups that are in order.
 UNREACHED = 1  # a variable without a value that factors do not lead to: bearings may
 OBSERVED = 2  # what cameras saw may be impossible
+OWN = 4  # residuals of own kinds may be no numbers

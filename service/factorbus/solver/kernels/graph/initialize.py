@@ -9,9 +9,19 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import place_idp
-from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of, is_one_of_many
-from factorbus.solver.kernels.model.kinds import base_kind, initializes
-from factorbus.solver.kernels.model.many import POSE, copy_pose, put_sensor
+from factorbus.solver.kernels.model.composed import (
+    FIRST,
+    INNER,
+    OUTER,
+    SCRATCH,
+    SECOND,
+    put_inner,
+    put_measurement,
+    put_sensor,
+)
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of, is_one_of_many, sample_count
+from factorbus.solver.kernels.model.imu import BIAS_B, POSE_B, place_by_imu
+from factorbus.solver.kernels.model.kinds import SCALE, base_kind, end_of_modifier, initializes
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.se2 import (
     compose_inverse_se2,
@@ -20,7 +30,7 @@ from factorbus.solver.kernels.model.se2 import (
     place_landmark_se2,
 )
 from factorbus.solver.kernels.model.se3 import compose_inverse_se3, compose_se3, place_landmark_se3
-from factorbus.solver.kernels.model.sizes import size_of
+from factorbus.solver.kernels.model.sizes import MOST_ENDS, arity_of, information_at, size_of
 
 _NOTHING = -1
 _WAITS = -2
@@ -114,10 +124,12 @@ def follow(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, r
 
 @part
 def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
-    """The same of the factor of more than two variables that begins at row f, for any of its rows: each waits for its
-    two variables.  A mount follows from nothing, and all else from it.
+    """The same of the factor with a base that begins at row f, for any of its rows: each waits for its two variables.
+    A mount, a scale or a clock's offset follows from nothing, and all else from it.
     """
     of, count, missing = base_kind(fac[f, at.F_KIND]), 0, -1
+    if fac[f, at.F_KIND] == at.IMU:
+        return follow_imu(compose, f, v0, var, fac, x, p, reached)
     if of < 0 or not initializes(of):  # a linear factor
         return _NOTHING
     for n in range(count_ends(f, fac)):
@@ -127,24 +139,60 @@ def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F
     if count == 0:
         return _NOTHING
     between = of == at.BETWEEN_SE2 or of == at.BETWEEN_SE3
-    if count > 1 or missing == 2 or (missing == 0 and not between):
+    if count > 1 or missing >= arity_of(of) or (missing == 0 and not between):
         return _WAITS
     new = end_of(f, missing, fac)
     if compose:
-        known, y = end_of(f, 1 - missing, fac), np.zeros(3 * POSE)
-        planar, forward = var[known, at.V_KIND] == at.SE2, missing == 1
-        copy_pose(planar, x, var[end_of(f, 2, fac), at.V_AT], y, 0)
-        put_sensor(planar, x, var[known, at.V_AT], y, POSE)
-        compose_end(of, forward, POSE if forward else 2 * POSE, 2 * POSE if forward else POSE, fac[f, at.F_AT], y, p)
-        kind, out = var[new, at.V_KIND], 2 * POSE
-        if between:
-            out = POSE
-            if planar:
-                compose_inverse_se2(y, 2 * POSE, y, 0, out)
-            else:
-                compose_inverse_se3(y, 2 * POSE, y, 0, out)
-        for c in range(size_of(kind)):
-            x[var[new, at.V_AT] + c] = y[out + c]
+        compose_base(f, missing, between, var, fac, x, p)
+    reached[new - v0] = 1
+    return new
+
+
+@part
+def compose_base(f: int, missing: int, between: bool, var: I64, fac: I64, x: F64, p: F64) -> None:
+    """Give the end of the base kind that has no value the one that makes the residual zero."""
+    kind, new, known = fac[f, at.F_KIND], end_of(f, missing, fac), end_of(f, 1 - missing, fac)
+    of, planar, forward = base_kind(kind), var[known, at.V_KIND] == at.SE2, missing == 1
+    places, y, z = np.empty(MOST_ENDS, np.int64), np.zeros(SCRATCH), np.empty(information_at(kind) + 3)
+    for n in range(count_ends(f, fac)):
+        places[n] = var[end_of(f, n, fac), at.V_AT]
+    put_measurement(kind, planar, x, places, p, fac[f, at.F_AT], z)
+    has_inner, scale = put_inner(kind, planar, x, places, z, y), end_of_modifier(kind, SCALE)
+    if scale >= 0:
+        for c in range(2 if planar else 3):
+            z[c] *= x[places[scale]]
+    put_sensor(has_inner, planar, x, var[known, at.V_AT], y, FIRST)
+    compose_end(of, forward, FIRST if forward else SECOND, SECOND if forward else FIRST, 0, y, z)
+    out = SECOND if forward else FIRST
+    if between and has_inner:
+        if planar:
+            compose_inverse_se2(y, out, y, INNER, OUTER)
+        else:
+            compose_inverse_se3(y, out, y, INNER, OUTER)
+        out = OUTER
+    for c in range(size_of(var[new, at.V_KIND])):
+        x[var[new, at.V_AT] + c] = y[out + c]
+
+
+@part
+def follow_imu(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
+    """The same of an inertial factor: pose, velocity and bias at its end follow from those at its beginning, one with
+    each of its rows, and nothing the other way."""
+    missing = -1
+    for n in range(BIAS_B, -1, -1):
+        v = end_of(f, n, fac)
+        if v >= v0 and reached[v - v0] == 0:
+            missing = n
+    if missing < 0:
+        return _NOTHING
+    if missing < POSE_B:
+        return _WAITS
+    new = end_of(f, missing, fac)
+    if compose:
+        places = np.empty(BIAS_B + 1, np.int64)
+        for n in range(BIAS_B + 1):
+            places[n] = var[end_of(f, n, fac), at.V_AT]
+        place_by_imu(missing, x, places, sample_count(f, fac), p[fac[f, at.F_AT] :])
     reached[new - v0] = 1
     return new
 

@@ -4,6 +4,7 @@
                  those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")
 `inline_kernel`  melts into the kernels that call it; for what runs in their innermost loops.
 `part`           a step of a kernel, called by it and compiled apart: one large function takes far longer to compile.
+`shared_kernel`  a part that kernels call by its address and do not link: for a large one that many of them call.
 
 Numba types a part once in a process; each kernel that calls it, also by way of other parts, links a copy of its own.
 A kernel that is called by another is a part there.
@@ -30,6 +31,8 @@ own compiler, with its rules for references and indices.
 """
 
 import atexit
+import contextlib
+import copy
 import functools
 import hashlib
 import os
@@ -51,11 +54,11 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.typing.templates import AttributeTemplate
+from numba.core.typing.templates import AttributeTemplate, make_concrete_template
 from numpy.typing import NDArray
 
 from factorbus.ownership import make_private
-from factorbus.proto import kinds
+from factorbus.proto import inertial, kinds
 
 # From beside this file: a copy of them elsewhere is one by itself.
 from . import releases
@@ -81,6 +84,7 @@ __all__ = [
     "iter_compile",
     "kernel",
     "part",
+    "shared_kernel",
     "sources_hash",
     "types",
     "vector_lanes",
@@ -145,6 +149,18 @@ class KernelFolder:
         if DISABLED:
             return function
         return self._linked(function)
+
+    def shared_kernel(self, *signature: Any) -> Any:
+        """`@shared_kernel(types of the arguments)`: compiled once, and called by its address where kernels call it."""
+
+        def made(function: Callable[..., Any]) -> Any:
+            if DISABLED:
+                return function
+            dispatcher = self._compiled(function, (signature,))
+            _SHARED.append(_Shared(dispatcher, lambda: f"{self._family} {self.path().name} {function.__qualname__}"))
+            return dispatcher
+
+        return made
 
     def path(self) -> Path:
         """The cache folder, made when it is first asked for.  Raises UnsafeFolder: others can write to it."""
@@ -287,15 +303,56 @@ def _common(kind: Any) -> Any:
 
 def _ours(dispatcher: Any) -> Any:
     dispatcher.factorbus = True
-    if not STOCK:
-        compile_ = dispatcher.compile
+    compile_ = dispatcher.compile
 
-        def compile_changed(signature: Any) -> Any:
-            with global_compiler_lock, _lowering.changed_numba():
+    def compile_changed(signature: Any) -> Any:
+        with global_compiler_lock:
+            _provide_shared()
+            with contextlib.nullcontext() if STOCK else _lowering.changed_numba():
                 return compile_(signature)
 
-        dispatcher.compile = compile_changed
+    dispatcher.compile = compile_changed
     return dispatcher
+
+
+class _Shared:
+    """A kernel that others call by its address, which this process knows by the name that is in their code."""
+
+    def __init__(self, dispatcher: Any, name: Callable[[], str]) -> None:
+        self._dispatcher, self._name, self._called_by = dispatcher, name, object()
+        self._template: Any = None
+        self._begun = False
+        dispatcher.get_call_template = lambda args, _kws: (self._found(), None, tuple(args), {})
+        dispatcher.get_overload = lambda _signature: self._called_by
+
+    @property
+    def is_being_made(self) -> bool:
+        return self._begun and self._template is None
+
+    def provide(self) -> None:
+        """The name stands for the machine code, which is compiled, or loaded, where it is not there yet."""
+        if self._begun:
+            return
+        self._begun = True
+        _compile_declared(self._dispatcher)
+        (result,) = self._dispatcher.overloads.values()
+        name, described = self._name(), copy.copy(result.fndesc)
+        llvmlite.binding.add_symbol(name, result.library.get_pointer_to_function(described.mangled_name))
+        described.mangled_name = name
+        self._dispatcher.targetctx.insert_user_function(self._called_by, described)
+        self._template = make_concrete_template(name, key=name, signatures=[result.signature])
+
+    def _found(self) -> Any:
+        self.provide()
+        return self._template
+
+
+def _provide_shared() -> None:
+    """All that code may call, also code from disk: what a shared kernel calls is declared before it."""
+    for shared in _SHARED:
+        if shared.is_being_made:
+            return
+        shared.provide()
 
 
 class _Compilations(event.TimingListener):
@@ -326,11 +383,13 @@ def _prune(base: Path, keep: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
+_SHARED: list[_Shared] = []
 _COMPILATIONS = _Compilations()
 event.register("numba:compile", _COMPILATIONS)
 
 _KERNELS = Path(__file__).parents[1]
 _LENSES = _KERNELS.with_name("lenses")
-WIRE_KINDS = Path(kinds.__file__)  # kernels have its names and sizes as constants
-_FOLDER = KernelFolder(_KERNELS, "kernels", also=(*_LENSES.glob("*.py"), WIRE_KINDS))
+WIRE_KINDS = Path(kinds.__file__), Path(inertial.__file__)  # kernels have their names and sizes as constants
+_FOLDER = KernelFolder(_KERNELS, "kernels", also=(*_LENSES.glob("*.py"), *WIRE_KINDS))
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part
+shared_kernel = _FOLDER.shared_kernel

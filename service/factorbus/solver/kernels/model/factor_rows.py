@@ -5,12 +5,14 @@ of that pair in Λ.  So whatever follows from which variables are joined, such a
 factor changes, is the same for all factors.  The first row has the kind, the measurement and the loss, and the first
 n − 1 rows name the variables.
 
-Such factors, and linear ones of one or two variables, are evaluated by `many`; their first row says how many variables
-and numbers of a residual they have.
+Such factors, linear ones, and those of clients' own kinds are evaluated by `many`; their first row says how many
+variables and numbers of a residual they have, and of an inertial one how many samples.
 """
 
-from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
+from factorbus.proto import inertial
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.expression_layout import X_BEFORE
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim, size_of
 
 
@@ -22,7 +24,7 @@ def loss_code(f: int, fac: I64) -> int:
 
 @inline_kernel
 def is_one_of_many(f: int, fac: I64) -> bool:
-    """Whether row f is of a factor that `many` evaluates: of more than two variables, or a linear one."""
+    """Whether row f is of a factor that `many` evaluates: of more than two variables, linear, or own."""
     return fac[f, at.F_FLAGS] >> at.OFFSET_SHIFT != 0
 
 
@@ -60,10 +62,21 @@ def residual_size(f: int, fac: I64) -> int:
     return own if own != 0 else residual_dim(fac[f, at.F_KIND])
 
 
+@inline_kernel
+def sample_count(f: int, fac: I64) -> int:
+    """How many samples the inertial factor has that begins at row f."""
+    return fac[f, at.F_FLAGS] >> at.SAMPLES_SHIFT & at.SAMPLES_MASK
+
+
 @part
-def information_start(f: int, var: I64, fac: I64) -> int:
-    """Where in the payload the information begins of the factor that begins at row f, behind its measurement."""
+def information_start(f: int, var: I64, fac: I64, payload: F64) -> int:
+    """Where in the payload the information begins of the factor that begins at row f, behind its measurement and what
+    is kept with that."""
     start, kind = fac[f, at.F_AT], fac[f, at.F_KIND]
+    if kind == at.OWN:
+        return start + int(payload[start + X_BEFORE])
+    if kind == at.IMU:
+        return start + inertial.SAMPLES + inertial.SAMPLE * sample_count(f, fac) + inertial.KEPT
     if kind != at.LINEAR:
         return start + information_at(kind)
     values = scalars = 0

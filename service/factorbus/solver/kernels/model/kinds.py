@@ -8,13 +8,13 @@ error when this file is imported.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
-from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part, shared_kernel, types
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import observation
 from factorbus.solver.kernels.model.dispatch import check_same, dispatcher
@@ -32,6 +32,7 @@ from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
 from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
 from factorbus.solver.kernels.model.sizes import MOST_ENDS
+from factorbus.solver.kernels.model.velocity import velocity_frame_se2, velocity_frame_se3
 from factorbus.solver.lenses.layout import GOOD
 
 _MOST = 6  # numbers of a residual and of a tangent: the size of the scratch that kernels have for a factor
@@ -52,7 +53,7 @@ class FactorModel:
                   returns what χ² has beside rᵀ Ω r
     positive_at:  where in the measurement a number has to be above zero
     quaternions:  where in the measurement quaternions begin.  directions: and directions.  Both become unit
-    base:         the kind that it is with the pose of a sensor, whose mount is a variable (`many`); and its residual
+    base:         the kind that it is with further variables (`composed`), whose residual it has
     """
 
     residual: Callable[..., Any]
@@ -101,18 +102,27 @@ FACTOR_MODELS = {
     "range_se3": FactorModel(range_se3, "MATH (3.23)", rigid=True, positive_at=0),
     "range_between_se2": FactorModel(range_between_se2, "MATH (3.34)", rigid=True, positive_at=0),
     "range_between_se3": FactorModel(range_between_se3, "MATH (3.34)", rigid=True, positive_at=0),
+    "velocity_frame_se2": FactorModel(velocity_frame_se2, "MATH (3.42)"),
+    "velocity_frame_se3": FactorModel(velocity_frame_se3, "MATH (3.42)"),
     "bearing_se2": FactorModel(bearing_se2, "MATH (3.24)", rigid=True),
     "bearing_se3": FactorModel(bearing_se3, "MATH (3.25)", rigid=True, directions=(0,)),
 }
+# By the last modifier of a kind with a base.
+_EQUATIONS = {
+    "mount": "MATH (3.35)",
+    "bias": "MATH (3.36)",
+    "scale": "MATH (3.37)",
+    "frame": "MATH (3.38)",
+    "arm": "MATH (3.41)",
+    "offset": "MATH (3.40)",
+}
 FACTOR_MODELS |= {
-    name: FactorModel(
-        FACTOR_MODELS[kind.base].residual,
-        "MATH (3.35)",
-        initializes=FACTOR_MODELS[kind.base].initializes,
-        lens_at=FACTOR_MODELS[kind.base].lens_at,
-        positive_at=FACTOR_MODELS[kind.base].positive_at,
-        quaternions=FACTOR_MODELS[kind.base].quaternions,
-        directions=FACTOR_MODELS[kind.base].directions,
+    name: replace(
+        FACTOR_MODELS[kind.base],
+        equation=_EQUATIONS[kind.modifiers[-1]],
+        common=False,
+        rigid=False,
+        bounded=False,
         base=kind.base,
     )
     for name, kind in FACTOR_KINDS.items()
@@ -142,12 +152,14 @@ def check_kinds() -> None:
 
 
 check_kinds()
-# The last two are in place of a kind's for linear factors, which `many` evaluates, and for members of a factor of more
-# than two variables, which are not looked at alone.
+# The last are in place of a kind's for linear factors, for members of a factor of more than two variables, which are
+# not looked at alone, for clients' own kinds, and for inertial factors.  `many` evaluates all of these but members.
 _MODELS = (
     *(FACTOR_MODELS[name] for name in FACTOR_KINDS),
     FactorModel(prior_point2, "MATH (3.26)"),
     FactorModel(prior_point2, "", bounded=True),
+    FactorModel(prior_point2, "MATH §3.11"),
+    FactorModel(prior_point2, "MATH (3.48)"),
 )
 
 
@@ -170,17 +182,54 @@ _DIRECTIONS = _starts(model.directions for model in _MODELS)
 # For Python, which asks for many factors at once: by the code of a kind.
 CAMERA = _LENS_AT >= 0
 BOUNDED = np.array([model.bounded for model in _MODELS])
+# Whether it is a family of kinds, whose variables and sizes are each factor's own: linear, own, inertial.
+OF_FAMILY = np.isin(np.arange(len(_MODELS)), (at.LINEAR, at.OWN, at.IMU))
 # By the code of a kind of variables.
 POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])
 VECTOR = np.array([kind.is_vector for kind in VARIABLE_KINDS.values()])
-SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), False, False])
+SEES_LANDMARK = np.array([*(kind.sees_landmark for kind in FACTOR_KINDS.values()), *[False] * at.FURTHER_CODES])
 _BASE = _table(at.FACTOR_CODES[model.base] if model.base else -1 for model in _MODELS)
+# Which variable of a kind is a pose, but no place in the map: a mount or another frame; −1: none.
+ASIDE_END = _table(
+    [
+        *(
+            min([n for n, role in enumerate(kind.roles) if role in ("mount", "frame")], default=-1)
+            for kind in FACTOR_KINDS.values()
+        ),
+        *[-1] * at.FURTHER_CODES,
+    ]
+)
+# Whether it joins two places in the map, which its first two variables are; linear factors are asked apart.
+JOINS_PLACES = np.array(
+    [
+        *(
+            len(FACTOR_KINDS[kind.base or name].connects) == 2 and not any(kind.roles[:2])
+            for name, kind in FACTOR_KINDS.items()
+        ),
+        *(code != at.MEMBER for code in range(at.LINEAR, len(_MODELS))),
+    ]
+)
+# Whether it says where its first variable is in the map, alone or with other variables that are no places.
+ABSOLUTE = np.array([*(kind.is_absolute for kind in FACTOR_KINDS.values()), *[False] * at.FURTHER_CODES])
+MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset")
+MOUNT, BIAS, SCALE, FRAME, ARM, OFFSET = range(6)
+# Which variable of a kind is that of a modifier; −1: it has none.
+_MODIFIER_ENDS = np.full((len(_MODELS), len(MODIFIERS)), -1, np.int64)
+for _row, _kind in enumerate(FACTOR_KINDS.values()):
+    for _n, _modifier in enumerate(_kind.modifiers):
+        _MODIFIER_ENDS[_row, MODIFIERS.index(_modifier)] = len(FACTOR_KINDS[_kind.base].connects) + _n
 
 
 @inline_kernel
 def base_kind(kind: int) -> int:
-    """The kind that it is of a sensor at a mount that is estimated; −1: of none."""
+    """The kind that it is with further variables; −1: of none."""
     return _BASE[kind]
+
+
+@inline_kernel
+def end_of_modifier(kind: int, modifier: int) -> int:
+    """Which of the variables of a kind is that of a modifier, such as MOUNT; −1: it has none."""
+    return _MODIFIER_ENDS[kind, modifier]
 
 
 @inline_kernel
@@ -244,5 +293,12 @@ def _other_residual(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F6
     return _other_residual_of(kind, x, ends, p, k, r, A, B)
 
 
-# The residual function of a kind: residual_of(kind, x, ends, p, k, r, A, B); gives what χ² has beside rᵀ Ω r.
-residual_of = part(dispatcher("residual_of", _common, _other_residual))
+_residual_of = inline_kernel(dispatcher("residual_of", _common, _other_residual))
+_FLOATS, _ROWS = types.float64[::1], types.float64[:, ::1]
+_ENDS = types.NamedUniTuple(types.int64, 2, Ends)
+
+
+@shared_kernel(types.int64, _FLOATS, _ENDS, _FLOATS, types.int64, _FLOATS, _ROWS, _ROWS)
+def residual_of(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F64, B: F64) -> float:
+    """The residual function of a kind; gives what χ² has beside rᵀ Ω r."""
+    return _residual_of(kind, x, ends, p, k, r, A, B)

@@ -15,11 +15,13 @@ _SIZE = np.array([kind.size for kind in _VARIABLES], np.int64)
 _DIM = np.array([kind.dim for kind in _VARIABLES], np.int64)
 _IS_VECTOR = np.array([kind.is_vector for kind in _VARIABLES])
 MOST_SCALARS = int(_DIM.max())  # of one variable: the size of the scratch that kernels have for it
-# By the code of a kind of factor; the last two are of linear factors, whose sizes are their own, and of members.
-_RESIDUAL_DIM = np.array([*(kind.dim for kind in _FACTORS), 0, 0], np.int64)
-_MEASURED = np.array([*(kind.size for kind in _FACTORS), 0, 0], np.int64)
-_ARITY = np.array([*(len(kind.connects) for kind in _FACTORS), 0, 2], np.int64)
-_ENDS = np.full((len(_FACTORS) + 2, MOST_ENDS), -1, np.int64)
+# By the code of a kind of factor; the last are of members, and of families, whose sizes are each factor's own.
+_NO_SIZE = (0,) * at.FURTHER_CODES
+_RESIDUAL_DIM = np.array([*(kind.dim for kind in _FACTORS), *_NO_SIZE], np.int64)
+_MEASURED = np.array([*(kind.size for kind in _FACTORS), *_NO_SIZE], np.int64)
+_ARITY = np.array([*(len(kind.connects) for kind in _FACTORS), *_NO_SIZE], np.int64)
+_ARITY[at.MEMBER] = 2
+_ENDS = np.full((len(_FACTORS) + at.FURTHER_CODES, MOST_ENDS), -1, np.int64)
 for _row, _kind in enumerate(_FACTORS):
     _ENDS[_row, : len(_kind.connects)] = [at.VARIABLE_CODES[end] for end in _kind.connects]
 _END_DIMS = np.where(_ENDS >= 0, _DIM[_ENDS], 0)
@@ -41,6 +43,12 @@ def dim_of(kind: int) -> int:
 def is_vector(kind: int) -> bool:
     """Whether a kind of variable is plain numbers, whose ⊞ is +."""
     return _IS_VECTOR[kind]
+
+
+@inline_kernel
+def has_own_sizes(kind: int) -> bool:
+    """Whether the sizes of a kind of factor that may begin a factor are each factor's own: linear, own, inertial."""
+    return kind >= at.LINEAR
 
 
 @inline_kernel

@@ -1,16 +1,18 @@
-"""Mounts of sensors that are found out: how far off they end, in units of what the map says of them.
+"""What sensors hide is found out: how far off it ends, in units of what the map says of it.
 
-    factorbus bench mounts [--seeds N] [--json]
+    factorbus bench calibration [--seeds N] [--json]
 
-Of each seed a drive is made anew, seeds are printed.  The mount is drawn around what the robot believes, 5 degrees and
-0.1 m standard deviation, which is its prior; the map's first pose is fixed.
+Of each seed a drive is made anew, seeds are printed.  What is hidden is drawn around what the robot believes, which is
+its prior: of a mount 5 degrees and 0.1 m standard deviation, of the others as `calibrated_drives` says.  The first
+pose of the map is fixed.
 
-    plane    a scanner sees posts, `landmark_se2_mount`
+    plane    a mount: a scanner sees posts, `landmark_se2_mount`
     space    the same in space, `landmark_se3_mount`
     camera   a camera sees corners, `point_seen_mount`
     way      a sensor measures its own way beside the robot's odometry, `between_se3_mount`
+    scale, frame, offset, bias   see `calibrated_drives`
 
-d² = eᵀ Σ⁻¹ e, e the error of the mount in its tangent space and Σ its covariance as the map has it.  A mount is found
+d² = eᵀ Σ⁻¹ e, e the error of what was hidden in its tangent space and Σ its covariance as the map has it.  It is found
 where d² is below the 99.73 % quantile of χ²: within three standard deviations, were it one number.  Of right
 covariances the mean of d² is the number of scalars; its range is that of 99.73 % of such means.
 """
@@ -26,15 +28,17 @@ from scipy.special import chdtri
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from naive.dense_factors import boxplus, pose_matrix, pose_vector, sensors
+from bench.calibrated_drives import DRIVES, way_of
+from naive.dense_derived import base_ends
+from naive.dense_factors import boxminus, boxplus, pose_matrix, pose_vector
 
 from factorbus.client import Camera, Draft
-from factorbus.client.frames import difference
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 
-WORLDS = ("plane", "space", "camera", "way")
+MOUNTS = ("plane", "space", "camera", "way")
+WORLDS = (*MOUNTS, *DRIVES)
 BELIEVED = {"se2": np.zeros(3), "se3": np.array([0, 0, 0, 0, 0, 0, 1.0])}
 PRIOR = {"se2": [0.1, 0.1, np.radians(5)], "se3": [0.1] * 3 + [np.radians(5)] * 3}
 ODOMETRY = {"se2": [0.02, 0.02, 0.01], "se3": [0.02] * 3 + [0.01] * 3}
@@ -45,7 +49,7 @@ _SURE = 0.9973
 
 def main() -> int:
     """Drive and tell; the exit code is 1 where fewer than 99 % are found, or a mean of d² is out of its range."""
-    parser = argparse.ArgumentParser(prog="factorbus bench mounts", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(prog="factorbus bench calibration", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=100, help="drives of each world")
     parser.add_argument("--seed", type=int, help="the first seed; without, another one each time")
     parser.add_argument("--only", default=",".join(WORLDS), help="WORLD,...")
@@ -75,7 +79,29 @@ def summary(world: str, first: int, d2: np.ndarray, dim: int) -> dict[str, Any]:
 
 
 def drive(world: str, seed: int) -> tuple[float, int]:
-    """(d², scalars) of the mount after a drive."""
+    """(d², scalars) of what was hidden, after a drive."""
+    return drive_with_mount(world, seed) if world in MOUNTS else calibrated_drive(world, seed)
+
+
+def calibrated_drive(world: str, seed: int) -> tuple[float, int]:
+    """The same of a drive of `calibrated_drives`."""
+    rng = np.random.default_rng(seed)
+    hidden = DRIVES[world](rng)
+    kind = "se3" if hidden.kind == "se3" else "se2"
+    solver, pose, way = Solver(Options()), BELIEVED[kind], BELIEVED[kind]
+    for n in range(POSES):
+        if n:
+            way = way_of(kind, n, hidden.speed)
+            pose = pose_vector(pose_matrix(pose) @ pose_matrix(way))
+        draft = hidden.step(n, pose, way)
+        solver.stage(draft.variable(kind, f"x{n}", pose if n == 0 else None, fixed=n == 0).batch())
+        solver.step()
+    solver.step(settle=True)
+    return off(solver, symbol("c", 0), hidden.kind, hidden.truth)
+
+
+def drive_with_mount(world: str, seed: int) -> tuple[float, int]:
+    """The same of the mount after a drive."""
     rng, space = np.random.default_rng(seed), "se2" if world == "plane" else "se3"
     believed, odometry = BELIEVED[space], np.array(ODOMETRY[space])
     mount = boxplus(space, believed, rng.normal(0, PRIOR[space]))
@@ -86,7 +112,7 @@ def drive(world: str, seed: int) -> tuple[float, int]:
     points = rng.uniform(-8, 8, (40, 2 if space == "se2" else 3)) + (0 if world != "camera" else np.array([12, 0, 0]))
     solver, pose, known = Solver(Options()), BELIEVED[space], set[int]()
     for n in range(POSES):
-        draft, way = Draft(), way_of(space, n)
+        draft, way = Draft(), way_of(space, n, 0.6)
         if n == 0:
             draft.variable(space, "x0", pose, fixed=True).variable(space, "m0", believed)
             draft.factor(f"prior_{space}", ["m0"], believed, sigmas=PRIOR[space])
@@ -96,7 +122,7 @@ def drive(world: str, seed: int) -> tuple[float, int]:
             measured = boxplus(space, way, rng.normal(0, odometry))
             draft.factor(f"between_{space}", [f"x{n - 1}", f"x{n}"], measured, sigmas=odometry)
             if world == "way":
-                a, b = sensors([before, pose, mount])
+                (a, b), _ = base_ends(f"between_{space}_mount", [before, pose, mount], np.zeros(0))
                 own = pose_vector(np.linalg.inv(pose_matrix(a)) @ pose_matrix(b))
                 own = boxplus(space, own, rng.normal(0, odometry))
                 draft.factor(f"between_{space}_mount", [f"x{n - 1}", f"x{n}", "m0"], own, sigmas=odometry)
@@ -105,17 +131,7 @@ def drive(world: str, seed: int) -> tuple[float, int]:
         solver.stage(draft.batch())
         solver.step()
     solver.step(settle=True)
-    return off(solver, space, mount)
-
-
-def way_of(space: str, n: int) -> np.ndarray:
-    """From one pose to the next: ahead, in curves, up and down."""
-    turn = 0.4 * np.sin(0.5 * n)
-    if space == "se2":
-        return np.array([0.6, 0.0, turn])
-    return boxplus(
-        "se3", BELIEVED["se3"], np.array([0.6, 0.0, 0.0, 0.3 * np.cos(0.9 * n), 0.3 * np.sin(0.7 * n), turn])
-    )
+    return off(solver, symbol("m", 0), space, mount)
 
 
 def see(
@@ -148,17 +164,14 @@ def see(
             draft.factor(f"landmark_se{dim}_mount", [f"x{n}", f"l{k}", "m0"], z, sigmas=[0.05] * dim)
 
 
-def off(solver: Solver, space: str, mount: np.ndarray) -> tuple[float, int]:
-    """d² of the mount."""
+def off(solver: Solver, key: int, kind: str, truth: np.ndarray) -> tuple[float, int]:
+    """(d², scalars) of a variable."""
     factored = solver.covariances.factored()
-    variable = factored.graph.find(symbol("m", 0))
-    dim = 3 if space == "se2" else 6
+    variable = factored.graph.find(key)
     sigma = CovarianceBlocks(factored).joint(np.array([variable]))
     (group,) = factored.graph.variables(np.array([variable]))
-    estimate = group.values[0]
-    error = difference(estimate, mount)
-    error = error * (1.0 if space == "se2" else np.array([1, 1, 1, 2, 2, 2]))
-    return float(error @ np.linalg.solve(sigma, error)), dim
+    error = boxminus(kind, truth, group.values[0])
+    return float(error @ np.linalg.solve(sigma, error)), error.size
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Factors of three variables: sensors whose mount on the robot is estimated, in every mode, with and without losses."""
+"""Kinds with further variables, such as mounts, biases and other frames: in every mode, with and without losses."""
+
+from collections.abc import Callable, Iterator
 
 import gtsam
 import numpy as np
@@ -6,10 +8,12 @@ import pytest
 from naive.dense_covariances import DenseCovariance
 from naive.dense_factors import boxplus, pose_matrix, pose_vector, residual
 from naive.dense_least_squares import DenseGraph, distance, full
-from naive.random_mounts import MOUNTED, mount_steps, true_mounts
+from naive.random_derived import calibration_steps, true_calibration
+from naive.random_mounts import mount_steps, true_mounts
 from naive.solver_parts import keys_in, kinds_in, linearization_points
 
 from factorbus.client import Camera, Draft
+from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import FactorGroup, Options, Solver, errors
@@ -24,6 +28,12 @@ from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.linearized import linearized_factor
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
+WORLDS: dict[str, Callable[..., Iterator[Batch]]] = {
+    "mounts": mount_steps,
+    "calibration": lambda seed, steps=4, **more: calibration_steps(seed, min(steps, 4), **more),
+}
+DERIVED = {name for name, kind in FACTOR_KINDS.items() if kind.roles}
+every_world = pytest.mark.parametrize("world", WORLDS)
 
 
 def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
@@ -34,16 +44,21 @@ def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
     }
 
 
-def test_every_kind_with_a_mount_occurs() -> None:
-    assert {group.kind for batch in mount_steps(1) for group in batch.factors} >= set(MOUNTED)
+def test_every_kind_with_further_variables_occurs() -> None:
+    assert {group.kind for steps in WORLDS.values() for batch in steps(1) for group in batch.factors} >= DERIVED
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("loss", ["", "huber", "dcs"])
-@pytest.mark.parametrize("seed", range(3))
-def test_the_settled_estimate_is_the_dense_optimum(seed: int, loss: str, mode: str) -> None:
+@pytest.mark.parametrize(
+    ("world", "seed", "loss"),
+    [
+        *(("mounts", seed, loss) for seed in range(3) for loss in ("", "huber", "dcs")),
+        *(("calibration", 0, loss) for loss in ("", "dcs")),
+    ],
+)
+def test_the_settled_estimate_is_the_dense_optimum(world: str, seed: int, loss: str, mode: str) -> None:
     solver, twin = Solver(Options(mode=mode)), DenseGraph()
-    for batch in mount_steps(seed, loss=loss):
+    for batch in WORLDS[world](seed, loss=loss):
         first = solver.stage(batch)
         report = solver.step()
         assert first == len(twin.factors)
@@ -61,9 +76,9 @@ def test_the_settled_estimate_is_the_dense_optimum(seed: int, loss: str, mode: s
         assert distance(kind, value, twin.values[key]) < 1e-7
 
 
-def solved(seed: int, mode: str = "bayes-tree", steps: int = 6) -> Solver:
+def solved(world: str, seed: int, mode: str = "bayes-tree", steps: int = 6) -> Solver:
     solver = Solver(Options(mode=mode))
-    for batch in mount_steps(seed, steps):
+    for batch in WORLDS[world](seed, steps):
         solver.stage(batch)
         solver.step()
     solver.step(settle=True)
@@ -85,9 +100,9 @@ def close(found: np.ndarray, wanted: np.ndarray, tell: float) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("seed", range(2))
-def test_covariances_are_those_of_the_dense_inverse(seed: int, mode: str) -> None:
-    solver = solved(seed, mode)
+@pytest.mark.parametrize(("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0)])
+def test_covariances_are_those_of_the_dense_inverse(world: str, seed: int, mode: str) -> None:
+    solver = solved(world, seed, mode)
     twin, blocks, keys = dense(solver), CovarianceBlocks(solver.covariances.factored()), keys_in(solver)
     diagonal = blocks.diagonal()
     for v, key in enumerate(keys):
@@ -97,12 +112,12 @@ def test_covariances_are_those_of_the_dense_inverse(seed: int, mode: str) -> Non
     close(blocks.joint(some), twin.joint([keys[v] for v in some]), 1e-7)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_gates_and_gains_are_those_of_dense_matrices(seed: int) -> None:
-    """Candidates of every kind with a mount, among some of two variables."""
-    solver, rng = solved(seed), np.random.default_rng(seed)
+@pytest.mark.parametrize(("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0)])
+def test_gates_and_gains_are_those_of_dense_matrices(world: str, seed: int) -> None:
+    """Candidates of every such kind, among some of two variables."""
+    solver, rng = solved(world, seed), np.random.default_rng(seed)
     twin, blocks, k = dense(solver), CovarianceBlocks(solver.covariances.factored()), 0
-    *_, last = mount_steps(seed, 6)
+    *_, last = WORLDS[world](seed, 6)
     groups = [FactorGroup(g.kind, g.keys, g.measured, 0.1 * g.information) for g in last.factors]
     rng.shuffle(groups)
     mark = blocks.factored.graph.mark()
@@ -113,15 +128,17 @@ def test_gates_and_gains_are_those_of_dense_matrices(seed: int) -> None:
             r, T, noise = twin.innovation(group.kind, keys, z, upper)
             assert found.dims[k] == len(r)
             close(found.predicted[k, : len(r), : len(r)], T, 1e-6)
-            np.testing.assert_allclose(found.distance[k], r @ np.linalg.solve(T + noise, r), rtol=1e-5)
+            squared = r @ np.linalg.solve(T + noise, r)
+            np.testing.assert_allclose(found.distance[k], squared, rtol=1e-5, atol=1e-12)
             gain = 0.5 * (np.linalg.slogdet(T + noise)[1] - np.linalg.slogdet(noise)[1])
             np.testing.assert_allclose(found.gain[k], gain, rtol=1e-6)
             k += 1
     assert k == len(found.distance)
 
 
-def test_why_says_of_such_a_factor_what_it_says_of_others() -> None:
-    solver = solved(1, steps=5)
+@every_world
+def test_why_says_of_such_a_factor_what_it_says_of_others(world: str) -> None:
+    solver = solved(world, 1, steps=5)
     twin, blocks, influence = dense(solver), CovarianceBlocks(solver.covariances.factored()), 0.0
     for factor, (kind, keys, z, W) in enumerate(_by_id(solver)):
         account = why_factor(blocks, factor)
@@ -152,14 +169,15 @@ def _by_id(solver: Solver) -> list[tuple[str, list[int], np.ndarray, np.ndarray]
     return [rows[each] for each in sorted(rows)]
 
 
-def test_a_loss_is_told_apart_from_the_residual() -> None:
+@every_world
+def test_a_loss_is_told_apart_from_the_residual(world: str) -> None:
     solver = Solver(Options())
-    for batch in mount_steps(3, loss="huber"):
+    for batch in WORLDS[world](3, loss="huber"):
         solver.stage(batch)
         solver.step()
     solver.step(settle=True)
     blocks = CovarianceBlocks(solver.covariances.factored())
-    mounted = {n: each for n, each in enumerate(_by_id(solver)) if each[0] in MOUNTED}
+    mounted = {n: each for n, each in enumerate(_by_id(solver)) if each[0] in DERIVED}
     twin = dense(solver).graph
     for factor, (kind, keys, z, W) in mounted.items():
         r, account = residual(kind, [twin.values[key] for key in keys], z), why_factor(blocks, factor)
@@ -168,10 +186,11 @@ def test_a_loss_is_told_apart_from_the_residual() -> None:
         assert account.chi2 == pytest.approx(r @ W @ r, rel=1e-6, abs=1e-9)
 
 
+@every_world
 @pytest.mark.parametrize("mode", MODES)
-def test_a_refused_insert_leaves_ids_rows_and_bits_as_they_were(mode: str) -> None:
+def test_a_refused_insert_leaves_ids_rows_and_bits_as_they_were(mode: str, world: str) -> None:
     """Also the first one that would have brought such factors."""
-    steps = list(mount_steps(5))
+    steps = list(WORLDS[world](5))
     plain = Variables("se2", np.array([-9]), np.zeros((1, 3)), fixed=True)
     loose = Variables("point2", np.array([-5]), np.zeros((1, 2)))
     solver, twin = Solver(Options(mode=mode)), Solver(Options(mode=mode))
@@ -212,8 +231,9 @@ def test_the_variable_that_is_wrong_is_named(end: int, wrong: int, error: type[e
     assert (solver.variable_count, solver.factor_count) == (0, 0)
 
 
-def test_a_loaded_solver_goes_on_to_the_bit() -> None:
-    steps, solver = list(mount_steps(2)), Solver(Options())
+@every_world
+def test_a_loaded_solver_goes_on_to_the_bit(world: str) -> None:
+    steps, solver = list(WORLDS[world](2)), Solver(Options())
     for batch in steps[:4]:
         solver.stage(batch)
         solver.step()
@@ -263,26 +283,32 @@ def test_repair_takes_out_what_a_sensor_saw_wrongly_and_keeps_the_mount() -> Non
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("held", ["poses", "points", "both", "mounts", "poses and mounts"])
-def test_whatever_is_fixed_the_estimate_is_the_dense_optimum(held: str, mode: str) -> None:
+@pytest.mark.parametrize(
+    ("world", "held"),
+    [
+        *(("mounts", held) for held in ("poses", "points", "both", "further", "poses and further")),
+        *(("calibration", held) for held in ("poses", "further")),
+    ],
+)
+def test_whatever_is_fixed_the_estimate_is_the_dense_optimum(world: str, held: str, mode: str) -> None:
     """With poses and points held the first row of a factor joins nothing that is free: its χ² is a constant."""
-    solver, twin, mounts = Solver(Options(mode=mode)), DenseGraph(), set(true_mounts())
-    known = {"both": ("poses", "points"), "poses and mounts": ("poses", "mounts")}.get(held, (held,))
+    solver, twin, further = Solver(Options(mode=mode)), DenseGraph(), {*true_mounts(), *true_calibration()}
+    known = {"both": ("poses", "points"), "poses and further": ("poses", "further")}.get(held, (held,))
     truth = Solver(Options())
-    for batch in mount_steps(11, 5):
+    for batch in WORLDS[world](11, 5):
         truth.stage(batch)
         truth.step()
     truth.step(settle=True)
     at = {key: row + 0.01 for key, (kind, row) in by_key(truth).items() if kind in ("se2", "point2", "point3")}
 
     def as_held(group: Variables) -> Variables:
-        of = "mounts" if int(group.keys[0]) in mounts else "points" if group.kind.startswith("point") else "poses"
+        of = "further" if int(group.keys[0]) in further else "points" if group.kind.startswith("point") else "poses"
         if of not in known:
             return group
         value = at.get(int(group.keys[0]), by_key(truth)[int(group.keys[0])][1])
         return group._replace(values=value[None], fixed=True)
 
-    for batch in mount_steps(11, 5):
+    for batch in WORLDS[world](11, 5):
         given = Batch(tuple(as_held(group) for group in batch.variables), batch.factors)
         solver.stage(given)
         report = solver.step()

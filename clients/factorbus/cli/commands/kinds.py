@@ -1,0 +1,121 @@
+"""`factorbus kinds`: the kinds of factors, and what a formula of one's own means."""
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from factorbus.cli.output.exits import REFUSED, Stopped, require
+from factorbus.cli.process.options import connect_option, json_option, timeout_option, zenoh_option
+from factorbus.wording import counted
+
+if TYPE_CHECKING:
+    from factorbus.proto.expressions.declaration import Declaration
+    from factorbus.proto.kinds import FactorKind
+
+
+@click.command()
+@click.argument("formula", required=False)
+@click.option("--map", "name", metavar="MAP", help="The own kinds that this map has factors of.")
+@click.option("--operations", is_flag=True, help="What a formula may do.")
+@click.option(
+    "--test", is_flag=True, help="Hold the solver's Jacobian of FORMULA against differences, at random values."
+)
+@connect_option
+@zenoh_option
+@timeout_option(30)
+@json_option
+def command(
+    formula: str | None,
+    name: str | None,
+    operations: bool,
+    test: bool,
+    endpoint: str,
+    zenoh: str,
+    timeout_s: float,
+    as_json: bool,
+) -> None:
+    """List the kinds of factors; or say what FORMULA, a kind of your own, means.
+
+    \b
+    factorbus kinds
+    factorbus kinds --operations
+    factorbus kinds 'near(a:se2,l:point2,z:1)=subtract(norm(act(inverse(a),l)),z)' --test
+    factorbus kinds --map warehouse
+    """
+    if (formula is not None) + (name is not None) + operations > 1 or (test and formula is None):
+        raise click.UsageError("give FORMULA (with --test or without), --map or --operations")
+    from factorbus.cli.output import console as screen
+    from factorbus.proto.kinds import FACTOR_KINDS
+
+    if operations:
+        found = _operations()
+    elif name is not None:
+        found = {kind.called: kind.name for kind in _of_map(name, endpoint, zenoh, timeout_s)}
+    elif formula is None:
+        found = {kind.name: f"{', '.join(kind.connects)}: {kind.residual}" for kind in FACTOR_KINDS.values()}
+    else:
+        declared = _declared(formula)
+        found = _meaning(declared) | ({"test": _tested(declared)} if test else {})
+    if as_json:
+        screen.document({"kinds": found})
+    elif found:
+        screen.table((called, str(means)) for called, means in found.items())
+    else:
+        screen.print_note(f"map {name} has factors of no kinds but the service's")
+
+
+def _operations() -> dict[str, str]:
+    from factorbus.proto.expressions.operations import OPERATIONS
+
+    return {each.name: each.means for each in OPERATIONS.values()}
+
+
+def _declared(formula: str) -> "Declaration":
+    from factorbus.proto.expressions.declaration import BadExpression
+    from factorbus.proto.expressions.formula import read_formula
+    from factorbus.proto.kinds import own_kind
+
+    try:
+        own_kind(declared := read_formula(formula))
+    except BadExpression as problem:
+        raise Stopped("unknown_kind", str(problem), REFUSED) from None
+    return declared
+
+
+def _meaning(declared: "Declaration") -> dict[str, Any]:
+    from factorbus.proto.expressions.frames import moving_ends
+    from factorbus.proto.kinds import own_kind
+
+    kind, moving, names = own_kind(declared), moving_ends(declared), declared.parameters
+    on_robot = ", ".join(names[n] for n, role in enumerate(kind.each_role) if role)
+    frame = "it says where they are in the map" if moving is None else "the same wherever the map lies"
+    return {
+        "name": kind.called,
+        "variables": ", ".join(f"{called} ({of})" for called, of in declared.variables),
+        "measured": kind.measured,
+        "residual": counted(kind.dim, "number"),
+        "frame": f"{frame}; on the robot: {on_robot}" if on_robot else frame,
+        "nodes": len(declared.nodes),
+        "formula": kind.name,
+    }
+
+
+def _tested(declared: "Declaration") -> str:
+    require("service", "factorbus kinds --test")
+    from factorbus.service.operations.check_kind import largest_difference
+
+    found = largest_difference(declared)
+    if found is None:
+        raise Stopped(
+            "not_finite", f"{declared.name} is no number at any of the random values that were tried", REFUSED
+        )
+    return f"at {found.tried} random values the solver's Jacobian is within {found.difference:.1e} of differences"
+
+
+def _of_map(name: str, endpoint: str, zenoh: str, timeout_s: float) -> list["FactorKind"]:
+    from factorbus.cli.process.bus import open_bus
+    from factorbus.proto.kinds import FACTOR_KINDS
+
+    with open_bus(endpoint, "kinds", zenoh, timeout_s) as bus, bus.map(name, mirror=False, create=False) as joined:
+        kinds = {group.kind: FACTOR_KINDS[group.kind] for group in joined.graph().batch.factors}
+    return [kind for kind in kinds.values() if kind.own]

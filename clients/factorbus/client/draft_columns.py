@@ -1,0 +1,77 @@
+"""The columns that a draft becomes: variables by kind, factors by kind and loss, in the order of their coming."""
+
+from __future__ import annotations
+
+from typing import TypedDict
+
+import numpy as np
+
+from factorbus.proto.arrays import F64
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.stamps import NO_STAMP
+
+
+class Held(TypedDict, total=False):
+    """What may be said of a variable besides its value: see `Draft`."""
+
+    fixed: bool
+    stamp: int | None
+
+
+class DraftColumns:
+    """What a draft holds, one list for each column of a message.  Nothing is checked here."""
+
+    def __init__(self) -> None:
+        self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[F64], list[int]]] = {}
+        self._factors: dict[tuple[str, str], tuple[list[list[int]], list[F64], list[F64], list[float]]] = {}
+        self._linear: list[Factors] = []
+
+    def add_variable(self, kind: str, key: int, value: F64 | None, fixed: bool, stamp: int) -> None:
+        """value: None where it comes without."""
+        keys, rows, stamps = self._variables.setdefault((kind, value is not None, fixed), ([], [], []))
+        keys.append(key)
+        stamps.append(stamp)
+        if value is not None:
+            rows.append(value)
+
+    def add_factor(self, kind: str, keys: list[int], measured: F64, triangle: F64, loss: tuple[str, float]) -> None:
+        """triangle: the upper one of its information.  loss: name and scale, ("", 0) for none."""
+        name, scale = loss
+        all_keys, all_measured, triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
+        scales.append(scale)
+        all_keys.append(keys)
+        all_measured.append(measured)
+        triangles.append(triangle)
+
+    def add_linear(self, factor: Factors) -> None:
+        """A linear factor, which is a group by itself."""
+        self._linear.append(factor)
+
+    def kinds(self) -> dict[int, str]:
+        """The kind of each variable, by its key."""
+        return {key: kind for (kind, *_), (keys, *_) in self._variables.items() for key in keys}
+
+    def batch(self) -> Batch:
+        """All of it as a message has it."""
+        variables = [
+            Variables(
+                kind,
+                np.array(keys, np.int64),
+                np.array(rows) if valued else None,
+                fixed,
+                np.array(stamps, np.int64) if any(stamp != NO_STAMP for stamp in stamps) else None,
+            )
+            for (kind, valued, fixed), (keys, rows, stamps) in self._variables.items()
+        ]
+        factors = [
+            Factors(
+                kind,
+                np.array(keys, np.int64),
+                np.array(measured),
+                np.array(information),
+                loss,
+                np.array(scales) if loss else None,
+            )
+            for (kind, loss), (keys, measured, information, scales) in self._factors.items()
+        ]
+        return Batch(tuple(variables), (*factors, *self._linear))

@@ -1,0 +1,66 @@
+"""Latitude, longitude and height as metres east, north and up of an origin, on the ellipsoid of WGS 84.
+
+With φ latitude, λ longitude, h height above the ellipsoid, a its larger half axis and e² its squared eccentricity,
+
+    N = a / √(1 − e² sin² φ),   X = (N + h) cos φ cos λ,   Y = (N + h) cos φ sin λ,   Z = (N (1 − e²) + h) sin φ   (1)
+
+are coordinates that turn with the Earth (ECEF), and east, north and up of (φ₀, λ₀, h₀) are R (X − X₀) with
+
+    R = [ −sin λ₀  cos λ₀  0 ;  −sin φ₀ cos λ₀  −sin φ₀ sin λ₀  cos φ₀ ;  cos φ₀ cos λ₀  cos φ₀ sin λ₀  sin φ₀ ]   (2)
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorbus.client.arguments import all_finite, as_numbers
+from factorbus.proto.arrays import F64
+from factorbus.proto.problems import BadShape
+
+SEMI_MAJOR_M = 6378137.0
+FLATTENING = 1.0 / 298.257223563
+_E2 = FLATTENING * (2.0 - FLATTENING)
+
+
+def enu(place: ArrayLike, origin: ArrayLike) -> F64:
+    """Metres (3,) east, north and up of `origin`, of a place; both latitude, longitude (degrees), height (metres).
+
+    Heights are above the ellipsoid, as receivers report them beside those above sea level.  Raises BadShape,
+    NotFiniteNumbers.
+    """
+    there, here = _checked("place", place), _checked("origin", origin)
+    return _axes(here) @ (ecef(there) - ecef(here))
+
+
+def ecef(place: ArrayLike) -> F64:
+    """X Y Z (3,), metres, of latitude, longitude (degrees), height (metres).  (1)"""
+    given = _checked("place", place)
+    (s, sin_east), (c, cos_east), height = *_sines(given), given[2]
+    N = SEMI_MAJOR_M / np.sqrt(1.0 - _E2 * s * s)
+    return np.array([(N + height) * c * cos_east, (N + height) * c * sin_east, (N * (1.0 - _E2) + height) * s])
+
+
+def _axes(origin: F64) -> F64:
+    """R, whose rows point east, north and up in X Y Z.  (2)"""
+    (s, sin_east), (c, cos_east) = _sines(origin)
+    return np.array(
+        [
+            [-sin_east, cos_east, 0.0],
+            [-s * cos_east, -s * sin_east, c],
+            [c * cos_east, c * sin_east, s],
+        ]
+    )
+
+
+def _sines(place: F64) -> tuple[F64, F64]:
+    angles = np.radians(place[:2])
+    return np.sin(angles), np.cos(angles)
+
+
+def _checked(what: str, place: ArrayLike) -> F64:
+    """Raises BadShape, NotFiniteNumbers."""
+    given = all_finite(what, as_numbers(what, place))
+    if given.shape != (3,):
+        raise BadShape(what, f"shape {given.shape}", "(3,): latitude, longitude (degrees), height (metres)")
+    if abs(given[0]) > 90.0:
+        raise BadShape(what, f"latitude {given[0]:g}", "-90 to 90 degrees: latitude, longitude, height")
+    return given

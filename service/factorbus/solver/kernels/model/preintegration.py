@@ -1,0 +1,165 @@
+"""Samples of an IMU, integrated on the manifold in the frame of the pose they begin at.  MATH §3.10.
+
+After C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, On-Manifold Preintegration for Real-Time Visual-Inertial
+Odometry, 2017.  A sample holds for its duration; the acceleration is turned by the rotation at its beginning, as in
+GTSAM's ManifoldPreintegration.
+
+    ω = ω̃ − β_g,  α = α̃ − β_a                                                                           (3.43)
+    Δp += Δv h + ½ ΔR α h²,   Δv += ΔR α h,   ΔR := ΔR exp(ω h)                                            (3.44)
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from factorbus.proto import inertial as of
+from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
+from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix
+
+_SMALL = (
+    0.04  # radians²: below, the terms of the series are exact to rounding, and take half the time of sine and cosine
+)
+
+
+class Preintegrated(NamedTuple):
+    """Δ of samples and its Jacobians by the bias (β_g, β_a), both in the frame where they begin.
+
+    q (4,): ΔR as a quaternion x y z w.  p, v (3,): metres, m/s.  R_b (3, 3): by β_g, of the rotation's right increment.
+    p_b, v_b (3, 6).
+    """
+
+    q: F64
+    p: F64
+    v: F64
+    R_b: F64
+    p_b: F64
+    v_b: F64
+
+
+class SampleTerms(NamedTuple):
+    """What a sample does: R (3, 3) the rotation before it, RA = R ⌊α⌋, E (3, 3) = exp(ω h), Jr (3, 3) = Jr(ω h)."""
+
+    R: F64
+    RA: F64
+    E: F64
+    Jr: F64
+
+
+@inline_kernel
+def nothing_yet() -> Preintegrated:
+    """Of no samples."""
+    q = np.zeros(4)
+    q[3] = 1.0
+    return Preintegrated(q, np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 6)), np.zeros((3, 6)))
+
+
+@inline_kernel
+def scratch_of_sample() -> SampleTerms:
+    """Room for a sample."""
+    return SampleTerms(np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)))
+
+
+@part
+def preintegrate(samples: int, z: F64, bias: F64, delta: Preintegrated, jacobians: bool) -> float:
+    """All samples of the measurement that begins at z[0], at a bias (6,); gives T, their durations together, seconds.
+
+    delta: of no samples, `nothing_yet`.  Without `jacobians` R_b, p_b and v_b are left as they are.
+    """
+    scratch, total = scratch_of_sample(), 0.0
+    for n in range(samples):
+        add_sample(z, of.SAMPLES + of.SAMPLE * n, bias, delta, scratch, jacobians)
+        total += z[of.SAMPLES + of.SAMPLE * n]
+    return total
+
+
+@inline_kernel
+def add_sample(z: F64, k: int, b: F64, delta: Preintegrated, sample: SampleTerms, jacobians: bool) -> None:
+    """One more sample, at z[k].  (3.44), (3.45)"""
+    q, p, v = delta.q, delta.p, delta.v
+    R = sample.R
+    h, ax, ay, az = z[k], z[k + 4] - b[3], z[k + 5] - b[4], z[k + 6] - b[5]
+    wx, wy, wz = h * (z[k + 1] - b[0]), h * (z[k + 2] - b[1]), h * (z[k + 3] - b[2])
+    fill_rotation(q, 0, R)
+    half, ew = half_turn(wx * wx + wy * wy + wz * wz)
+    ex, ey, ez = half * wx, half * wy, half * wz
+    if jacobians:
+        _describe(ax, ay, az, wx, wy, wz, sample)
+        _add_jacobians(h, delta, sample)
+    for c in range(3):
+        turned = R[c, 0] * ax + R[c, 1] * ay + R[c, 2] * az
+        p[c] += h * (v[c] + 0.5 * h * turned)
+        v[c] += h * turned
+    q[0], q[1], q[2], q[3] = quat_product(q[0], q[1], q[2], q[3], ex, ey, ez, ew)
+    n = 1.5 - 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])  # 1/|q|, next to 1
+    q[0], q[1], q[2], q[3] = n * q[0], n * q[1], n * q[2], n * q[3]
+
+
+@inline_kernel
+def fill_rotation(q: F64, k: int, R: F64) -> None:
+    """R (3, 3) := the rotation of the quaternion at q[k]."""
+    R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2] = rotation_matrix(q, k)
+
+
+@inline_kernel
+def half_turn(square: float) -> tuple:
+    """(sin(θ/2)/θ, cos(θ/2)) of θ²: the quaternion of a rotation vector φ is (sin(θ/2)/θ φ, cos(θ/2))."""
+    if square >= _SMALL:
+        angle = math.sqrt(square)
+        return math.sin(0.5 * angle) / angle, math.cos(0.5 * angle)
+    s = 0.25 * square
+    half = 0.5 - s * (1 / 12 - s * (1 / 240 - s * (1 / 10080 - s * (1 / 725760))))
+    return half, 1.0 - s * (0.5 - s * (1 / 24 - s * (1 / 720 - s * (1 / 40320 - s * (1 / 3628800)))))
+
+
+@inline_kernel
+def _describe(ax: float, ay: float, az: float, x: float, y: float, z: float, sample: SampleTerms) -> None:
+    """RA, E and Jr of a sample that turns by φ = (x, y, z) radians.
+
+    exp φ = I + a ⌊φ⌋ + b ⌊φ⌋²,   Jr(φ) = I − b ⌊φ⌋ + c ⌊φ⌋²
+    """
+    R, RA = sample.R, sample.RA
+    for i in range(3):
+        RA[i, 0] = R[i, 1] * az - R[i, 2] * ay
+        RA[i, 1] = R[i, 2] * ax - R[i, 0] * az
+        RA[i, 2] = R[i, 0] * ay - R[i, 1] * ax
+    q = x * x + y * y + z * z
+    if q < _SMALL:
+        a = 1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q * (1 / 39916800)))))
+        b = 0.5 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q * (1 / 479001600)))))
+        c = 1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q * (1 / 39916800))))
+    else:
+        angle = math.sqrt(q)
+        a, sine = math.sin(angle) / angle, math.sin(0.5 * angle)
+        b, c = 2.0 * sine * sine / q, (1.0 - a) / q
+    fill_series(a, b, x, y, z, sample.E)
+    fill_series(-b, c, x, y, z, sample.Jr)
+
+
+@inline_kernel
+def fill_series(a: float, b: float, x: float, y: float, z: float, M: F64) -> None:
+    """M = I + a ⌊φ⌋ + b ⌊φ⌋², φ = (x, y, z)."""
+    M[0, 0], M[1, 1], M[2, 2] = 1.0 - b * (y * y + z * z), 1.0 - b * (x * x + z * z), 1.0 - b * (x * x + y * y)
+    M[0, 1], M[1, 0] = b * x * y - a * z, b * x * y + a * z
+    M[0, 2], M[2, 0] = b * x * z + a * y, b * x * z - a * y
+    M[1, 2], M[2, 1] = b * y * z - a * x, b * y * z + a * x
+
+
+@inline_kernel
+def _add_jacobians(h: float, delta: Preintegrated, sample: SampleTerms) -> None:
+    """By the bias, over one more sample.  (3.45)
+
+    p_b += v_b h − ½ h² (R ⌊α⌋ R_b | R),  v_b −= h (R ⌊α⌋ R_b | R),  R_b := exp(ω h)ᵀ R_b − Jr(ω h) h
+    """
+    R_b, p_b, v_b, R, RA, E, Jr = delta.R_b, delta.p_b, delta.v_b, sample.R, sample.RA, sample.E, sample.Jr
+    for a in range(3):
+        for c in range(3):
+            turned = RA[a, 0] * R_b[0, c] + RA[a, 1] * R_b[1, c] + RA[a, 2] * R_b[2, c]
+            p_b[a, c] += h * (v_b[a, c] - 0.5 * h * turned)
+            v_b[a, c] -= h * turned
+            p_b[a, 3 + c] += h * (v_b[a, 3 + c] - 0.5 * h * R[a, c])
+            v_b[a, 3 + c] -= h * R[a, c]
+    for c in range(3):
+        b0, b1, b2 = R_b[0, c], R_b[1, c], R_b[2, c]
+        for a in range(3):
+            R_b[a, c] = E[0, a] * b0 + E[1, a] * b1 + E[2, a] * b2 - h * Jr[a, c]

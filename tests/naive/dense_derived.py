@@ -1,0 +1,77 @@
+"""Residuals of kinds with further variables, by matrices and their exponential: the twin of `composed`."""
+
+from collections.abc import Callable
+
+import numpy as np
+from naive.dense_poses import pose_matrix, pose_vector
+from scipy.linalg import expm
+
+MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset")
+
+
+def parts_of(kind: str) -> tuple[str, list[str]]:
+    """The base kind, and what it is with."""
+    words, modifiers = kind.split("_"), list[str]()
+    while words[-1] in MODIFIERS and words[0] != "velocity":
+        modifiers.insert(0, words.pop())
+    return "_".join(words), modifiers
+
+
+def is_derived(kind: str) -> bool:
+    return bool(parts_of(kind)[1])
+
+
+def twist_matrix(v: np.ndarray) -> np.ndarray:
+    """The generator of a motion, (3,) in the plane or (6,) in space: velocities, then angular velocities."""
+    n = 2 if len(v) == 3 else 3
+    xi = np.zeros((n + 1, n + 1))
+    xi[:n, n] = v[:n]
+    if n == 2:
+        xi[0, 1], xi[1, 0] = -v[2], v[2]
+    else:
+        xi[:3, :3] = np.cross(np.eye(3), v[3:])
+    return xi
+
+
+def base_ends(kind: str, ends: list[np.ndarray], z: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """The values that the base kind has its residual at, and what it has measured."""
+    _, modifiers = parts_of(kind)
+    count = len(ends) - len(modifiers)
+    of, z, width = dict(zip(modifiers, ends[count:], strict=True)), z.copy(), len(ends[0])
+    left, right = np.eye(3 if width == 3 else 4), np.eye(3 if width == 3 else 4)
+    if "mount" in of:
+        right = pose_matrix(of["mount"])
+    if "offset" in of:
+        n = 3 if width == 3 else 6
+        right = expm(twist_matrix(z[-n:]) * of["offset"][0])
+        z = z[:-n]
+    if "frame" in of:
+        left = pose_matrix(of["frame"])
+    if "arm" in of:
+        z = np.concatenate([z, of["arm"]])
+    if "scale" in of:
+        z[: len(left) - 1] *= of["scale"][0]
+    if not {"mount", "offset", "frame"} & of.keys():
+        return ends[:count], z
+    return [pose_vector(left @ pose_matrix(end) @ right) if len(end) == width else end for end in ends[:count]], z
+
+
+def derived_residual(
+    residual: Callable[[str, list[np.ndarray], np.ndarray], np.ndarray],
+    kind: str,
+    ends: list[np.ndarray],
+    z: np.ndarray,
+) -> np.ndarray:
+    """r; residual: that of the base kind."""
+    base, modifiers = parts_of(kind)
+    r = residual(base, *base_ends(kind, ends, z))
+    return r + ends[-1] if "bias" in modifiers else r
+
+
+def with_further(kind: str, z: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What a kind measures where its base kind measures z: with velocities behind it, without a lever arm."""
+    _, modifiers = parts_of(kind)
+    n = 2 if "se2" in kind else 3
+    if "arm" in modifiers:
+        z = z[:-n]
+    return np.concatenate([z, rng.normal(0, 0.7, 3 if n == 2 else 6)]) if "offset" in modifiers else z
