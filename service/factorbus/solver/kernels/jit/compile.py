@@ -131,6 +131,7 @@ class KernelFolder:
         self._flags = _QUICK_FLAGS if quick else _EXACT_FLAGS if exact else _FLAGS
         self._cache = cache_in(self.path)
         self._path: Path | None = None
+        self._shared: list[_Shared] = []
 
     def kernel(self, *signatures: Any) -> Any:
         """`@kernel` or `@kernel("int64(float64[::1])", ...)`: see the head of this file."""
@@ -151,13 +152,15 @@ class KernelFolder:
         return self._linked(function)
 
     def shared_kernel(self, *signature: Any) -> Any:
-        """`@shared_kernel(types of the arguments)`: compiled once, and called by its address where kernels call it."""
+        """`@shared_kernel(types of the arguments)`: compiled once; kernels of this folder call it by its address."""
 
         def made(function: Callable[..., Any]) -> Any:
             if DISABLED:
                 return function
             dispatcher = self._compiled(function, (signature,))
-            _SHARED.append(_Shared(dispatcher, lambda: f"{self._family} {self.path().name} {function.__qualname__}"))
+            self._shared.append(
+                _Shared(dispatcher, lambda: f"{self._family} {self.path().name} {function.__qualname__}")
+            )
             return dispatcher
 
         return made
@@ -185,9 +188,9 @@ class KernelFolder:
     def _linked(self, function: Callable[..., Any], **flags: Any) -> Any:
         """A function that kernels link.  Called from Python, as tests do, it is compiled as a kernel."""
         if STOCK:
-            return _ours(numba.njit(**{**self._flags, **flags})(function))
+            return self._ours(numba.njit(**{**self._flags, **flags})(function))
         flags = {"pipeline_class": _lowering.PartCompiler, **self._flags, **flags}
-        dispatcher = _ours(numba.njit(**flags)(function))
+        dispatcher = self._ours(numba.njit(**flags)(function))
         find = dispatcher.get_call_template
         dispatcher.get_call_template = lambda args, kws: find(tuple(map(_common, args)), kws)
 
@@ -199,7 +202,27 @@ class KernelFolder:
     def _alone(self, function: Callable[..., Any]) -> Any:
         """A function that Python calls."""
         compiler = {} if STOCK else {"pipeline_class": _lowering.KernelCompiler}
-        return _ours(numba.njit(**compiler, **self._flags)(function))
+        return self._ours(numba.njit(**compiler, **self._flags)(function))
+
+    def _ours(self, dispatcher: Any) -> Any:
+        dispatcher.factorbus = True
+        compile_ = dispatcher.compile
+
+        def compile_changed(signature: Any) -> Any:
+            with global_compiler_lock:
+                self._provide_shared()
+                with contextlib.nullcontext() if STOCK else _lowering.changed_numba():
+                    return compile_(signature)
+
+        dispatcher.compile = compile_changed
+        return dispatcher
+
+    def _provide_shared(self) -> None:
+        """All that code may call, also code from disk: what a shared kernel calls is declared before it."""
+        for shared in self._shared:
+            if shared.is_being_made:
+                return
+            shared.provide()
 
     def _make(self) -> Path:
         base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
@@ -301,20 +324,6 @@ def _common(kind: Any) -> Any:
     return types.intp if is_zero else types.boolean if isinstance(kind, types.BooleanLiteral) else kind
 
 
-def _ours(dispatcher: Any) -> Any:
-    dispatcher.factorbus = True
-    compile_ = dispatcher.compile
-
-    def compile_changed(signature: Any) -> Any:
-        with global_compiler_lock:
-            _provide_shared()
-            with contextlib.nullcontext() if STOCK else _lowering.changed_numba():
-                return compile_(signature)
-
-    dispatcher.compile = compile_changed
-    return dispatcher
-
-
 class _Shared:
     """A kernel that others call by its address, which this process knows by the name that is in their code."""
 
@@ -347,14 +356,6 @@ class _Shared:
         return self._template
 
 
-def _provide_shared() -> None:
-    """All that code may call, also code from disk: what a shared kernel calls is declared before it."""
-    for shared in _SHARED:
-        if shared.is_being_made:
-            return
-        shared.provide()
-
-
 class _Compilations(event.TimingListener):
     """Adds up the time of the outermost compilations of our kernels; the compiler lock makes them sequential."""
 
@@ -383,7 +384,6 @@ def _prune(base: Path, keep: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-_SHARED: list[_Shared] = []
 _COMPILATIONS = _Compilations()
 event.register("numba:compile", _COMPILATIONS)
 
