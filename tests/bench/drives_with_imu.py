@@ -40,7 +40,7 @@ class Drive:
 
 
 def drive_of(name: str, steps: int | None = None) -> Drive:
-    """A drive by its name, or so many of its steps."""
+    """A drive by its name, or its first steps."""
     return {"kitti": _kitti, "imu_gps": _imu_gps}[name](steps)
 
 

@@ -40,7 +40,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="factorbus bench inertial", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", default=",".join(DRIVES), help="NAME,... of " + ", ".join(DRIVES))
     parser.add_argument("--every", type=int, default=10, help="look at χ² at every N-th step")
-    parser.add_argument("--steps", type=int, help="the first so many steps alone")
+    parser.add_argument("--steps", type=int, help="how many first steps; without, all")
     parser.add_argument("--json", action="store_true", help="print the rows as JSON")
     told = parser.parse_args()
     rows: list[dict[str, Any]] = []

@@ -135,7 +135,7 @@ def test_integrated_at_a_hundred_times_the_rate_it_is_the_same_to_the_order_of_a
 
 
 def at_rate(z: np.ndarray, parts: int) -> np.ndarray:
-    """The same with every sample in so many parts."""
+    """The same with every sample cut into equal parts."""
     finer = np.repeat(samples(z), parts, axis=0)
     finer[:, 0] /= parts
     return np.concatenate([z[: of.SAMPLES], finer.ravel()])

@@ -17,6 +17,7 @@ from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.why import why_factor
+from factorbus.solver.graph.own_kinds import MOST_OWN
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 
@@ -171,6 +172,28 @@ def test_the_name_of_another_kind_is_refused_while_that_has_factors() -> None:
     after.stage(Batch((Variables("vector1", keys[0, 2:], np.zeros((1, 1))),), again.factors))
     after.step()
     assert graph_in(after).own == (FACTOR_KINDS[other].name,)
+
+
+def test_a_map_has_room_for_own_kinds_again_whose_factors_are_gone() -> None:
+    solver = Solver(Options())
+    solver.stage(with_range(bias_of_range.name))
+    solver.step()
+    keys = np.array([[symbol("x", 0), symbol("l", 0), symbol("b", 0)]])
+
+    def another(n: int) -> Batch:
+        name = bias_of_range.name.replace("bias_of_range", f"kind{n}")
+        return Batch((), (Factors(name, keys, np.array([[2.0]]), np.array([[1.0]])),))
+
+    for n in range(MOST_OWN - 1):
+        solver.stage(another(n))
+    with pytest.raises(errors.TooLarge, match=rf"{MOST_OWN + 1} own kinds, the limit is {MOST_OWN}"):
+        solver.stage(another(MOST_OWN))
+    solver.step()
+    gone = Change("remove_factors", factors=np.arange(4, solver.factor_count))
+    after = with_changes(solver, (gone,))[0]
+    after.stage(another(MOST_OWN))
+    after.step()
+    assert len(graph_in(after).own) == 3
 
 
 def test_a_residual_that_is_no_number_at_the_first_values_is_refused() -> None:

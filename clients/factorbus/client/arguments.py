@@ -56,7 +56,7 @@ def all_finite(what: str, numbers: F64) -> F64:
 
 
 def checked_row(what: str, numbers: Any, size: int) -> F64:
-    """`numbers` as so many floats, all finite.  Raises BadShape, NotFiniteNumbers."""
+    """`numbers` as `size` floats, all finite.  Raises BadShape, NotFiniteNumbers."""
     row = as_numbers(what, numbers, f"({size},) numbers")
     if row.shape != (size,):
         raise BadShape(what, f"shape {row.shape}", f"({size},)")

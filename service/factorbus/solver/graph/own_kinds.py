@@ -29,6 +29,8 @@ def take_own_kinds(graph: FactorGraph, batch: BatchLike) -> None:
         if before != name:
             raise errors.KindTaken(_called(name), before, name)
     kept = tuple(name for name in graph.own if held.get(_called(name)) == name)
+    if len(kept) + len(new) > MOST_OWN:  # those whose factors are gone, or never came, make room
+        kept = tuple(_in_use(graph))
     if len(kept) + len(new) > MOST_OWN:
         raise errors.TooLarge("the map", len(kept) + len(new), MOST_OWN, "own kinds")
     graph.own = (*kept, *new)
