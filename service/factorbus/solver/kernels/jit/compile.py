@@ -31,7 +31,6 @@ own compiler, with its rules for references and indices.
 """
 
 import atexit
-import contextlib
 import copy
 import functools
 import hashlib
@@ -155,8 +154,8 @@ class KernelFolder:
         """`@shared_kernel(types of the arguments)`: compiled once; kernels of this folder call it by its address."""
 
         def made(function: Callable[..., Any]) -> Any:
-            if DISABLED:
-                return function
+            if DISABLED or STOCK:
+                return self.part(function)
             dispatcher = self._compiled(function, (signature,))
             self._shared.append(
                 _Shared(dispatcher, lambda: f"{self._family} {self.path().name} {function.__qualname__}")
@@ -211,10 +210,11 @@ class KernelFolder:
         def compile_changed(signature: Any) -> Any:
             with global_compiler_lock:
                 self._provide_shared()
-                with contextlib.nullcontext() if STOCK else _lowering.changed_numba():
+                with _lowering.changed_numba():
                     return compile_(signature)
 
-        dispatcher.compile = compile_changed
+        if not STOCK:
+            dispatcher.compile = compile_changed
         return dispatcher
 
     def _provide_shared(self) -> None:
