@@ -24,8 +24,8 @@ TWINS = (
     {"proto/problems", "solver/errors"},  # an error of the solver travels as the problem of that name and code
     {"proto/factor_kind", "solver/graph/factors"},  # a kind as the wire has it, and with its code in kernels
     {"proto/variable_kinds", "solver/graph/variables"},
-    {"client/expressions", "solver/kernels/model/expression_groups"},  # an operation as it is written and as it is done
-    {"client/expressions", "solver/kernels/model/expression_vectors"},
+    {"client/expressions", "solver/formulas/groups"},  # an operation as it is written and as it is done
+    {"client/expressions", "solver/formulas/vectors"},
     {"client/expressions", "solver/kernels/model/se2"},
     {"service/config", "workers/config"},  # BadConfig, of two programs
     {"idp/classical", "idp/independent", "idp/minimal"},  # three ways to the same covariance

@@ -25,7 +25,7 @@ from factorbus.wording import counted
 
 CONSTANT = "constant"
 MOST_VARIABLES, MOST_NODES, MOST_MEASURED, MOST_RESIDUAL, MOST_SCALARS = 16, 500, 64, 64, 128
-MOST_JACOBIAN = 1 << 16  # numbers of the Jacobians of all nodes
+MOST_RESULTS = 1024  # numbers of the values of all nodes
 MEASURED = "z"
 NAME = re.compile(r"[a-z][a-z0-9_]{0,62}")
 PARAMETER = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -122,7 +122,7 @@ def _checked(declared: Declaration) -> tuple[Type, ...]:
     scalars, numbers = sum(map(tangent_size, types[:-1])), 0
     for node in declared.nodes:
         types.append(_type_of_node(declared, node, types))
-        numbers += tangent_size(types[-1]) * scalars
+        numbers += value_size(types[-1])
     if not isinstance(types[-1], int) or types[-1] > MOST_RESIDUAL:
         raise BadExpression(
             f"{declared.name}: its residual is {name_of(types[-1])}; wanted 1 to {MOST_RESIDUAL} numbers"
@@ -132,10 +132,10 @@ def _checked(declared: Declaration) -> tuple[Type, ...]:
         raise BadExpression(
             f"{declared.name}: its residual does not depend on {missing[0]}; wanted it without that one"
         )
-    if scalars > MOST_SCALARS or numbers > MOST_JACOBIAN:
+    if scalars > MOST_SCALARS or numbers > MOST_RESULTS:
         raise BadExpression(
-            f"{declared.name}: its variables have {scalars} scalars and the Jacobians of its nodes {numbers} numbers; "
-            f"wanted at most {MOST_SCALARS} and {MOST_JACOBIAN}"
+            f"{declared.name}: its variables have {scalars} scalars and the results of its nodes {numbers} numbers; "
+            f"wanted at most {MOST_SCALARS} and {MOST_RESULTS}"
         )
     return tuple(types)
 

@@ -112,7 +112,7 @@ def read_group(raw: bytes, here: int, factors: int, group: I64) -> int:
     group[gt.G_LOSS] = TOKENS[loss, w.W_CODE] if loss >= 0 else 0
     group[gt.G_KEYS], group[gt.G_NUMBERS], group[gt.G_STAMPS] = at[w.KEYS], at[w.NUMBERS], at[w.STAMPS]
     group[gt.G_INFORMATION], group[gt.G_SCALE] = at[w.INFORMATION], at[w.SCALE]
-    group[gt.G_ENDS], group[gt.G_INSTRUCTIONS], group[gt.G_LENGTH] = (
+    group[gt.G_ENDS], group[gt.G_HEAD], group[gt.G_LENGTH] = (
         gt.NOWHERE,
         gt.NOWHERE,
         0,

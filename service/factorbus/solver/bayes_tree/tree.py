@@ -14,8 +14,8 @@ from factorbus.solver.graph.factor_graph import FactorGraph, roomy, with_room
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree import records
 from factorbus.solver.kernels.bayes_tree.add_to_tree import SAVED
-from factorbus.solver.kernels.bayes_tree.begin_step import HESSIAN
 from factorbus.solver.kernels.bayes_tree.changed_variables import exchange, list_changed
+from factorbus.solver.kernels.bayes_tree.hessian_room import MOST_ROOM
 from factorbus.solver.kernels.bayes_tree.reset_estimate import reset_to_linearization
 from factorbus.solver.kernels.bayes_tree.step import tree_step
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -169,7 +169,7 @@ class CliqueTree(Arenas):
         if counts[at.SCALARS] > self.scalars.shape[1]:
             self.scalars = _widened(self.scalars, counts[at.SCALARS])
         new = factors - int(self.state[tl.S_FACTORS])
-        if (need := int(self.state[tl.S_HESSIAN]) + new * HESSIAN) > self.hessian.size:
+        if (need := int(self.state[tl.S_HESSIAN]) + new * MOST_ROOM) > self.hessian.size:
             pages.enlarge(self, "hessian", roomy(need, self.hessian.size))
         if 2 * new > len(self.saved):
             self.saved = np.empty((4 * new, SAVED))

@@ -16,14 +16,16 @@ import numpy as np
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.changes.requested import Edits
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factor_rows import is_first, losses_of, with_losses
+from factorbus.solver.graph.factor_rows import is_first, losses_of, rows_of_arities, with_losses
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.edit_factors import LOG_WIDTH, MOST_LINKS, edit_factors, relink
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size
+from factorbus.solver.kernels.bayes_tree.hessian_room import JACOBIAN, hessian_size
 from factorbus.solver.kernels.bayes_tree.remove_rows import close_gaps, open_gaps
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.expressions import BEHIND
+from factorbus.solver.kernels.model.kinds import CAMERA
 from factorbus.solver.sparse.anchors import find_undetermined
 
 # What nobody has any more of the payload or of the Hessians, as a share of all: with more everything is packed anew.
@@ -152,6 +154,7 @@ class FactorEdit:
         for row in self.renewed.tolist():
             dims = [VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])].dim if v >= 0 else 0 for v in _pair(graph, row)]
             start, size = int(tree.link[row, tl.L_AT]), hessian_size(dims[0], dims[1])
+            size += _jacobian_size(graph, row)
             hessians.append(tree.hessian[start : start + size].copy())
             start = int(graph.fac[row, at.F_AT])
             weighed.append(graph.payload[start : start + int(self._widths(np.array([row]))[0])].copy())
@@ -201,3 +204,16 @@ class FactorEdit:
 def _pair(graph: FactorGraph, row: int) -> list[int]:
     """The variables that a row joins; −1: no second one."""
     return graph.fac[row, at.F_I : at.F_J + 1].tolist()
+
+
+def _jacobian_size(graph: FactorGraph, row: int) -> int:
+    """Numbers of a Jacobian that are kept behind the Hessian of a row, as `hessian_room.jacobian_size` has it."""
+    offset = int(graph.fac[row, at.F_FLAGS]) >> at.OFFSET_SHIFT & at.OFFSET_MASK
+    head = row - offset
+    ends = int(graph.fac[head, at.F_FLAGS]) >> at.ENDS_SHIFT & at.ENDS_MASK
+    rows = int(rows_of_arities(np.array([ends]))[0])
+    if not ends or offset != rows - 1 or CAMERA[graph.fac[head, at.F_KIND]]:
+        return 0
+    kind = graph.kind_of(head)
+    size = kind.dim * (sum(end.dim for end in kind.connects) + 1) + BEHIND
+    return size if size <= JACOBIAN * rows else 0

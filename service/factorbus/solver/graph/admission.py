@@ -11,7 +11,14 @@ from factorbus.solver import errors
 from factorbus.solver.graph import observations, own_kinds
 from factorbus.solver.graph.columns import Columns, floats_at, ints_at, limit_lenses, locate_columns
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, imu_of, kinds_by_id, linear_of
+from factorbus.solver.graph.factors import (
+    FACTOR_KIND_OF_CODE,
+    LOSS_OF_CODE,
+    FactorKind,
+    imu_of,
+    kinds_by_number,
+    linear_of,
+)
 from factorbus.solver.graph.groups import BatchLike
 from factorbus.solver.graph.triangulation import place_by_bearings
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -28,7 +35,7 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     find_first_outside,
 )
-from factorbus.solver.kernels.model.expression_layout import X_ID
+from factorbus.solver.kernels.model.expression_layout import X_NUMBER
 
 _NEAR = "choose units and an origin near the data"
 
@@ -44,7 +51,7 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns) -> int:
     mark, first = graph.mark(), graph.next_id
     own = graph.own
     try:
-        if not isinstance(batch, Columns) and groups[:, gt.G_LENGTH].any():
+        if not isinstance(batch, Columns) and any("(" in group.kind for group in batch.factors):
             own_kinds.take_own_kinds(graph, batch)
         fault, g, row, rest = admit_groups(raw, groups, graph.array_table)
         if fault == gt.NO_LIMITS:
@@ -141,8 +148,8 @@ def _kind_of(graph: FactorGraph, raw: bytes, group: I64) -> FactorKind:
     if (code := int(group[gt.G_KIND])) < at.LINEAR:
         return FACTOR_KIND_OF_CODE[code]
     if code == at.OWN:
-        own = floats_at(raw, int(group[gt.G_INSTRUCTIONS]), int(group[gt.G_LENGTH]))
-        return kinds_by_id(graph.own)[int(own[X_ID])]
+        own = floats_at(raw, int(group[gt.G_HEAD]), int(group[gt.G_LENGTH]))
+        return kinds_by_number(graph.own)[int(own[X_NUMBER])]
     if code == at.IMU:
         return imu_of((int(group[gt.G_SIZE]) - inertial.SAMPLES) // inertial.SAMPLE)
     ends = ints_at(raw, int(group[gt.G_ENDS]), int(group[gt.G_ARITY]))

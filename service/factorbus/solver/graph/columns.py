@@ -137,7 +137,7 @@ def _table_before(variables: int, form: tuple[Any, ...]) -> I64:
 
 def _count_columns(groups: I64) -> int:
     """How many columns the groups have."""
-    places = [gt.G_KEYS, gt.G_NUMBERS, gt.G_INFORMATION, gt.G_SCALE, gt.G_STAMPS, gt.G_ENDS, gt.G_INSTRUCTIONS]
+    places = [gt.G_KEYS, gt.G_NUMBERS, gt.G_INFORMATION, gt.G_SCALE, gt.G_STAMPS, gt.G_ENDS, gt.G_HEAD]
     return int(np.count_nonzero(groups[:-1, places] != gt.NOWHERE))
 
 
@@ -186,12 +186,12 @@ def _iter_rows(variables: int, form: tuple[Any, ...]) -> Iterator[tuple[int, ...
 
 @lru_cache(maxsize=1024)
 def _columns_of_kind(name: str) -> tuple[bytes, ...]:
-    """Of a kind of a family: the codes of the kinds of the variables, and of an own one instructions."""
+    """Of a kind of a family: the codes of the kinds of the variables, and of an own one its head."""
     kind = FACTOR_KINDS.get(name)
     if kind is None:
         return ()
     ends = np.array([end.code for end in kind.connects], _I64).tobytes()
-    return (ends, kind.instructions.astype(_F64).tobytes()) if kind.before else (ends,)
+    return (ends, kind.head.astype(_F64).tobytes()) if kind.before else (ends,)
 
 
 def _check_loss(kind: str, loss: str, scale: tuple[Any, Any], count: int) -> None:

@@ -8,12 +8,13 @@ A factor's id is the number of factors that the map took in before it, and stays
 ids of the first rows are listed, those of the rows behind them follow each other without gaps.
 """
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from factorbus.proto import inertial
 from factorbus.solver.errors import printed
+from factorbus.solver.formulas.own_code import own_code_of
 from factorbus.solver.graph.arenas import Arenas, lines
 from factorbus.solver.graph.factor_rows import (
     arities_of,
@@ -23,7 +24,14 @@ from factorbus.solver.graph.factor_rows import (
     losses_of,
     rows_of_arities,
 )
-from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind, imu_of, kinds_by_id, linear_of
+from factorbus.solver.graph.factors import (
+    FACTOR_KIND_OF_CODE,
+    LOSS_OF_CODE,
+    FactorKind,
+    imu_of,
+    kinds_by_number,
+    linear_of,
+)
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.graph.rows import Rows, Span
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -32,7 +40,7 @@ from factorbus.solver.kernels.graph.key_table import enter_keys, find_variable, 
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
-from factorbus.solver.kernels.model.expression_layout import X_ID
+from factorbus.solver.kernels.model.expression_layout import X_NUMBER
 from factorbus.solver.kernels.model.kinds import CAMERA, OF_FAMILY
 from factorbus.solver.kernels.model.retract import common_label, gather_values
 
@@ -52,7 +60,8 @@ class FactorGraph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = records.Graph._fields
-    NOT_KEPT = ("_rows", "_id_room", "_unlisted", "array_table")  # of a solver's state: they follow from the rest
+    # Of a solver's state: they follow from the rest.
+    NOT_KEPT = ("_rows", "_id_room", "_unlisted", "array_table", "own_code")
 
     def __init__(self) -> None:
         # Room for the first few hundred factors: the step that finds none takes several times as long.
@@ -74,6 +83,12 @@ class FactorGraph(Arenas):
         self.holes = 0  # numbers of the payload that no factor has any more
         self.own: tuple[str, ...] = ()  # the own kinds of its factors: their formulas, each once
         self._rows = Rows()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Whoever says which own kinds the graph has holds their code."""
+        super().__setattr__(name, value)
+        if name == "own":
+            self.own_code = tuple(map(own_code_of, value))
 
     @property
     def has_observations(self) -> bool:
@@ -260,7 +275,7 @@ class FactorGraph(Arenas):
         if code < at.LINEAR:
             return FACTOR_KIND_OF_CODE[code]
         if code == at.OWN:
-            return kinds_by_id(self.own)[int(self.payload[self.fac[row, at.F_AT] + X_ID])]
+            return kinds_by_number(self.own)[int(self.payload[self.fac[row, at.F_AT] + X_NUMBER])]
         if code == at.IMU:
             return imu_of(flags >> at.SAMPLES_SHIFT & at.SAMPLES_MASK)
         return linear_of(flags >> at.DIM_SHIFT, tuple(self.var[self.ends_of(row), at.V_KIND].tolist()))

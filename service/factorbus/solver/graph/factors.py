@@ -12,7 +12,7 @@ import numpy as np
 from factorbus.proto import inertial
 from factorbus.proto import kinds as wire
 from factorbus.proto.expressions.declaration import Declaration
-from factorbus.solver.graph.instructions import id_of, instructions_of
+from factorbus.solver.formulas.own_code import number_of, own_head
 from factorbus.solver.graph.variables import VARIABLE_KINDS, VariableKind
 from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.kernels.model import layout
@@ -38,14 +38,14 @@ class FactorKind:
     kept: int = 0
 
     @property
-    def instructions(self) -> F64:
+    def head(self) -> F64:
         """Of an own kind: what stands before the measurement in the payload of each factor."""
-        return instructions_of(self.own) if self.own else _NOTHING
+        return own_head(self.own) if self.own else _NOTHING
 
     @property
     def before(self) -> int:
         """How many numbers these are."""
-        return self.instructions.size
+        return self.head.size
 
     @property
     def information_at(self) -> int:
@@ -107,10 +107,10 @@ def imu_of(samples: int) -> FactorKind:
 
 
 @lru_cache(maxsize=64)
-def kinds_by_id(names: tuple[str, ...]) -> dict[int, FactorKind]:
+def kinds_by_number(names: tuple[str, ...]) -> dict[int, FactorKind]:
     """Own kinds by the number that stands in the payload of their factors."""
     kinds = [_of_family(name) for name in names]
-    return {id_of(kind.own): kind for kind in kinds if kind.own}
+    return {number_of(kind.own): kind for kind in kinds if kind.own}
 
 
 _NOTHING: F64 = np.empty(0)

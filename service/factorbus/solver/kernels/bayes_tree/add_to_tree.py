@@ -5,7 +5,8 @@ import math
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import chi2_of_factor, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian import linearize_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian_room import jacobian_size, last_of_hessian
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
@@ -100,18 +101,11 @@ def add_factors(graph: Graph, tree: Tree, f1: int) -> bool:
 
 @inline_kernel
 def place_hessians(f: int, var: I64, fac: I64, link: I64, state: I64) -> None:
-    """Room for the Hessians of all rows of the factor that begins at row f."""
+    """Room for the Hessians of all rows of the factor that begins at row f, and for what is kept of its Jacobian."""
     for row in range(f, f + rows_of(f, fac)):
         link[row, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] = last_of_hessian(row, var, fac, link) + 1
-
-
-@inline_kernel
-def last_of_hessian(row: int, var: I64, fac: I64, link: I64) -> int:
-    """Where the χ² of the Hessian of a row is, the last of its numbers."""
-    i, j = fac[row, at.F_I], fac[row, at.F_J]
-    size = hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
-    return link[row, tl.L_AT] + size - 1
+    state[tl.S_HESSIAN] += jacobian_size(f, var, fac)
 
 
 @inline_kernel

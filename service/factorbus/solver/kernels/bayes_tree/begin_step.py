@@ -3,6 +3,7 @@
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.hessian_room import MOST_ROOM
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.graph.initialize import follow, reach
 from factorbus.solver.kernels.graph.local_init import initialize_new
@@ -10,10 +11,6 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.records import table_of
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
-from factorbus.solver.kernels.model.sizes import MOST_SCALARS
-
-# Doubles of the largest Hessian record.
-HESSIAN = 3 * MOST_SCALARS * MOST_SCALARS + 2 * MOST_SCALARS + 1
 
 
 @part
@@ -28,7 +25,7 @@ def begin_step(graph: Graph, tree: Tree) -> int:
         or f1 > len(link)
         or counts[at.VALUES] > lin.shape[1]
         or counts[at.SCALARS] > scalars.shape[1]
-        or state[tl.S_HESSIAN] + (f1 - f0) * HESSIAN > hessian.size
+        or state[tl.S_HESSIAN] + (f1 - f0) * MOST_ROOM > hessian.size
         or 2 * (f1 - f0) > len(saved)
     ):
         return tl.NO_ROOM

@@ -9,7 +9,7 @@ from factorbus.solver.kernels.bayes_tree.allocator import give_numbers
 from factorbus.solver.kernels.bayes_tree.assemble import UPDATE_AT, UPDATE_SIZE, UPDATE_WIDTH, split_sizes
 from factorbus.solver.kernels.bayes_tree.eliminate import first_end
 from factorbus.solver.kernels.bayes_tree.fronts import free_clique
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size
+from factorbus.solver.kernels.bayes_tree.hessian_room import hessian_size
 from factorbus.solver.kernels.bayes_tree.records import Affected, Fronts, Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at

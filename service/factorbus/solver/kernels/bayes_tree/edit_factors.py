@@ -15,7 +15,8 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import largest_diagonal_of, next_incidence
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, has_free
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import chi2_of_factor, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian import linearize_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian_room import hessian_size
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, part

@@ -6,12 +6,16 @@ import math
 
 import numpy as np
 
+from factorbus.solver.kernels.bayes_tree.hessian_room import copy_linear, jacobian_at, jacobian_size
+from factorbus.solver.kernels.bayes_tree.own_error import exact_error_of_own
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import end_of, is_one_of_many
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.many import linearize_many, square_of
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
 
@@ -20,14 +24,17 @@ SWITCHED = 30.0
 
 
 @part
-def exact_error(
-    f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64
-) -> tuple[float, float, float]:  # fmt: skip
-    """What the model of factor f, linearized at `lin`, misses at `values` = lin ⊞ δ, in standard deviations: of the
-    residual, (9.11), and of the force, as its Jacobian is another one there, (9.31); and its χ² there.
+def exact_error(f: int, graph: Graph, tree: Tree) -> tuple[float, float, float]:
+    """What the model of factor f, linearized where its variables are, misses at their values, δ further, in standard
+    deviations: of the residual, (9.11), and of the force, as its Jacobian is another one there, (9.31); and its χ²
+    there.
     """
-    if is_one_of_many(f, fac):
-        return exact_error_of_many(f, var, fac, lin, values, payload, delta)
+    if is_one_of_many(f, graph.fac):
+        if graph.fac[f, at.F_KIND] == at.OWN and jacobian_size(f, graph.var, graph.fac) != 0:
+            return exact_error_of_own(f, graph, tree)
+        return exact_error_of_many(f, graph, tree)
+    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
+    lin, delta = tree.lin[0], tree.scalars[0]
     r, now, A, B = np.zeros(at.R_SIZE), np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     A_now, B_now = np.zeros((6, 6)), np.zeros((6, 6))
     chi2 = evaluate_apart(f, var, fac, values, payload, now, A_now, B_now)
@@ -56,29 +63,41 @@ def exact_error(
 
 
 @part
-def exact_error_of_many(
-    f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64
-) -> tuple[float, float, float]:  # fmt: skip
+def exact_error_of_many(f: int, graph: Graph, tree: Tree) -> tuple[float, float, float]:
     """The same of a factor that `many` evaluates."""
-    more, now = linearize_many(f, var, fac, values, payload)
-    _, was = linearize_many(f, var, fac, lin, payload)
-    dim, kind, start = len(now.J), fac[f, at.F_KIND], now.start
-    chi2, force, total = more + square_of(now), 0.0, 0.0
-    switched = is_camera(kind) and (was.r[at.R_STATUS] != GOOD) != (now.r[at.R_STATUS] != GOOD)
-    for n in range(start.size - 1):
+    var, fac, payload, kind = graph.var, graph.fac, graph.payload, graph.fac[f, at.F_KIND]
+    more, now = linearize_many(f, var, fac, graph.values, payload)
+    dim, columns = now.J.shape
+    chi2, switched = more + square_of(now), False
+    if jacobian_size(f, var, fac) != 0:
+        linear, k = tree.hessian, jacobian_at(f, var, fac, tree.link)
+    else:
+        _, was = linearize_many(f, var, fac, tree.lin[0], payload)
+        switched = is_camera(kind) and (was.r[at.R_STATUS] != GOOD) != (now.r[at.R_STATUS] != GOOD)
+        linear, k = np.empty(dim * (columns + 1)), 0
+        copy_linear(was, linear)
+    # Of each scalar: δ, (J_now − J)ᵀ r, and the square of its column of J_now.
+    moved, turned, diagonal = np.zeros(columns), np.zeros(columns), np.zeros(columns)
+    for n in range(now.start.size - 1):
         d = var[end_of(f, n, fac), at.V_SCALAR]
-        if d < 0:
-            continue
-        for c in range(start[n], start[n + 1]):
-            turned = diagonal = 0.0
-            for a in range(dim):
-                was.r[a] += was.J[a, c] * delta[d + c - start[n]]
-                turned += (now.J[a, c] - was.J[a, c]) * now.r[a]
-                diagonal += now.J[a, c] * now.J[a, c]
-            if diagonal > 0.0:
-                force += turned * turned / diagonal
+        for c in range(now.start[n], now.start[n + 1] if d >= 0 else now.start[n]):
+            moved[c] = tree.scalars[0, d + c - now.start[n]]
+    total = 0.0
     for a in range(dim):
-        total += (now.r[a] - was.r[a]) * (now.r[a] - was.r[a])
+        row, r = k + dim + a * columns, now.r[a]
+        gap = r - linear[k + a]
+        for c in range(columns):
+            slope, slope_was = now.J[a, c], linear[row + c]
+            gap -= slope_was * moved[c]
+            turned[c] += (slope - slope_was) * r
+            diagonal[c] += slope * slope
+        total += gap * gap
+    force = 0.0
+    for n in range(now.start.size - 1):
+        d = var[end_of(f, n, fac), at.V_SCALAR]
+        for c in range(now.start[n], now.start[n + 1] if d >= 0 else now.start[n]):
+            if diagonal[c] > 0.0:
+                force += turned[c] * turned[c] / diagonal[c]
     return SWITCHED if switched else math.sqrt(max(total, 0.0)), math.sqrt(force), chi2
 
 

@@ -6,6 +6,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import has_free
 from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, shift_error_weight
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_isotropic
+from factorbus.solver.kernels.bayes_tree.hessian_room import hessian_size, keep_jacobian
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import Panel, put, six, zero
@@ -18,12 +19,6 @@ from factorbus.solver.kernels.model.many import Many, linearize_many, square_of,
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
-
-
-@inline_kernel
-def hessian_size(di: int, dj: int) -> int:
-    """Doubles that the Hessian of a factor takes; dj is 0 where there is no second variable."""
-    return di * di + di * dj + dj * dj + di + dj + 1
 
 
 @part
@@ -81,6 +76,7 @@ def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
             _gradient_of(n == 0 and m == 1, many, n, g, out)
             _gradient_of(n == 0 and m < ends, many, m, g + di, out)
             put(out, g + di + dj, 0.0)
+    keep_jacobian(f, graph, tree, many)
     chi2 = more + square_of(many)
     put(out, last, chi2)
     if f < state[tl.S_TAKEN] and not has_free(f, var, fac):

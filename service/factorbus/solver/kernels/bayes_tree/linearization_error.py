@@ -175,13 +175,13 @@ def evaluate_factor(
     """
     var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
     node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
-    lin, delta, error, full, leaves = tree.lin[0], tree.scalars[0], 0.0, 0.0, 0.0
+    error, full, leaves = 0.0, 0.0, 0.0
     kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
     if not is_bounded(kind) or kind == at.PRIOR_SE3 or loss_code(f, fac) != at.NO_LOSS:
         if how < MODEL:
             chi2 = any_chi2(f, var, fac, values, payload)
         else:
-            error, force, chi2 = exact_error(f, var, fac, lin, values, payload, delta)
+            error, force, chi2 = exact_error(f, graph, tree)
             error = min(error, MOST_ERROR)
             full = min(error + force, MOST_ERROR)
             leaves = full = ROBUST * full if loss_code(f, fac) != at.NO_LOSS else full

@@ -165,7 +165,7 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
             i, j, fault = find_ends(kind, int_at(raw, first), int_at(raw, first + 8 * (arity - 1)), graph)
         if fault != gt.GOOD:
             return n, fault, rest
-        copy_numbers(raw, group[gt.G_INSTRUCTIONS], before, payload, p)
+        copy_numbers(raw, group[gt.G_HEAD], before, payload, p)
         copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p + before)
         copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + stored)
         fault = check_measured(kind, kinds, p, size, payload)

@@ -16,7 +16,7 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     are_within,
 )
-from factorbus.solver.kernels.model.expression_layout import X_BEFORE, X_LENGTH, X_QUATERNION
+from factorbus.solver.kernels.model.expression_layout import X_BEFORE, X_QUATERNION, X_WIDTH
 from factorbus.solver.kernels.model.imu_noise import write_root
 from factorbus.solver.kernels.model.kinds import direction_at, positive_at, quaternion_at
 from factorbus.solver.kernels.model.se2 import wrap
@@ -59,10 +59,10 @@ def check_linear(kinds: I64, p: int, size: int, payload: F64) -> int:
 @part
 def check_own_measurement(p: int, payload: F64) -> int:
     """What is wrong with a new measurement of an own kind, whose payload starts at p."""
-    measured, end, turn = int(payload[p + X_LENGTH]), int(payload[p + X_BEFORE]), int(payload[p + X_QUATERNION])
-    if not are_within(MOST_NUMBER, p + measured, end - measured, payload):
+    end, turn = int(payload[p + X_BEFORE]), int(payload[p + X_QUATERNION])
+    if not are_within(MOST_NUMBER, p + X_WIDTH, end - X_WIDTH, payload):
         return gt.OUT_OF_BOUNDS
-    if turn >= 0 and not normalize_quaternion(payload, p + measured + turn):
+    if turn >= 0 and not normalize_quaternion(payload, p + X_WIDTH + turn):
         return gt.BAD_QUATERNION
     return gt.GOOD
 

@@ -20,7 +20,7 @@ G_ARITY = 11  # of linear, inertial and own kinds, whose sizes are no other kind
 G_ROWS = 12  # numbers of a residual,
 G_SIZE = 13  # numbers measured of each factor,
 G_ENDS = 14  # and the offset of the codes of the kinds of their variables, as int64; of all others NOWHERE
-G_INSTRUCTIONS = 15  # of own kinds: the offset of what stands before the measurement, NOWHERE: it is none,
+G_HEAD = 15  # of own kinds: the offset of what stands before the measurement, NOWHERE: it is none,
 G_LENGTH = 16  # and how many numbers that are
 G_WIDTH = 17
 

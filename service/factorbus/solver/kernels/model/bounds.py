@@ -6,7 +6,7 @@ docs/decisions/0001-number-bounds.md says why these.
 from factorbus.proto import inertial
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.expression_layout import X_LENGTH
+from factorbus.solver.kernels.model.expression_layout import X_WIDTH
 from factorbus.solver.kernels.model.factor_rows import information_start, is_member, residual_size
 from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import size_of
@@ -74,7 +74,7 @@ def are_usual(v0: int, f0: int, graph_table: I64) -> bool:
         p, dim = information_start(f, var, fac, payload), residual_size(f, fac)
         start, kept = fac[f, at.F_AT], inertial.KEPT if fac[f, at.F_KIND] == at.IMU else 0
         if fac[f, at.F_KIND] == at.OWN:
-            start += int(payload[start + X_LENGTH])
+            start += X_WIDTH
         if not are_within(USUAL_NUMBER, start, p - kept - start, payload):
             return False
         for a in range(dim):

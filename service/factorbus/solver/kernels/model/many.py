@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part, shared_kernel, types
+from factorbus.solver.kernels.jit.machine_code import first_of
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.composed import composed
-from factorbus.solver.kernels.model.expressions import evaluate_own
+from factorbus.solver.kernels.model.expressions import BEHIND, chi2_of_own, evaluate_own
 from factorbus.solver.kernels.model.factor_rows import (
     count_ends,
     end_of,
@@ -55,16 +56,24 @@ def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
 def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
     """Residual and Jacobians of the factor that begins at row f; what χ² has beside rᵀ Ω r."""
     kind, ends, dim, more = fac[f, at.F_KIND], count_ends(f, fac), residual_size(f, fac), 0.0
-    start, kinds, places = np.zeros(ends + 1, np.int64), np.empty(ends, np.int64), np.empty(ends, np.int64)
+    numbers = np.empty(3 * ends + 1, np.int64)
+    start, kinds, places = numbers[: ends + 1], numbers[ends + 1 : 2 * ends + 1], numbers[2 * ends + 1 :]
+    start[0] = 0
     for n in range(ends):
         v = end_of(f, n, fac)
         kinds[n], places[n] = var[v, at.V_KIND], var[v, at.V_AT]
         start[n + 1] = start[n] + dim_of(kinds[n])
+    if kind == at.OWN:
+        room = np.empty(dim * (start[ends] + 1) + BEHIND)
+        many = Many(room[:dim], room[dim : dim * (start[ends] + 1)].reshape(dim, start[ends]), start)
+        more = evaluate_own(True, f, var, fac, x, payload, first_of(room, 0))
+        if more > 0.0:
+            many.r[:] = 0.0
+            many.J[:] = 0.0
+        return more, many
     many = Many(np.zeros(max(dim, at.R_SIZE)), np.zeros((dim, start[ends])), start)
     if kind == at.LINEAR:
         linear(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
-    elif kind == at.OWN:
-        more = evaluate_own(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
     elif kind == at.IMU:
         imu(x, places, sample_count(f, fac), payload[fac[f, at.F_AT] :], many.r, many.J)
     else:
@@ -160,5 +169,7 @@ def soften_many(loss: int, scale: float, more: float, many: Many) -> float:
 @part
 def chi2_of_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> float:
     """χ² of the factor that begins at row f."""
+    if fac[f, at.F_KIND] == at.OWN:
+        return chi2_of_own(f, var, fac, x, payload)
     more, many = linearize_many(f, var, fac, x, payload)
     return more + square_of(many)

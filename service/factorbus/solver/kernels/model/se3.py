@@ -8,6 +8,7 @@ import math
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel
 
 HALF_TURN = 1e-6  # an error quaternion with less than that for w is one of 180°
+HALF_TURN_SLOPE = 2.0 / math.pi
 
 
 @inline_kernel
@@ -45,7 +46,7 @@ def turn_slope(w: float) -> float:
     At w = 0 the residual v is longest, so its derivative along its axis is 0: a variable that a single factor holds
     would seem free.  There the slope is that of the chord to v = 0, which is half a turn away: 2/π.  MATH (3.6)
     """
-    return w if w > HALF_TURN else 0.6366197723675814
+    return w if w > HALF_TURN else HALF_TURN_SLOPE
 
 
 @inline_kernel

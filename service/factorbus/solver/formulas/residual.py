@@ -1,0 +1,185 @@
+"""The function of a kind in LLVM's language: its residual, and the Jacobian of that.  MATH §3.11.
+
+    function(x, var, fac, z, out, slopes) -> 1 where all of r and J are numbers of at most MOST_RESIDUAL, else 0
+
+x: all values; var: the table of variables; fac: the rows of the factor; z: what is measured; out: r
+(dim,), and behind it J (dim, scalars), row by row, written where `slopes` is not 0, with room for a vector register
+after it.
+
+The numbers come first.  Then the slopes, forward mode: for as many scalars of the variables at once as a vector
+register has lanes, in a loop from the last scalars to the first, so that what a row's last vector writes beyond the
+row is written anew.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from factorbus.proto.expressions.declaration import CONSTANT, Declaration, ExpressionNode
+from factorbus.proto.expressions.operations import SO3, Type, tangent_size, value_size
+from factorbus.solver.formulas import groups, vectors
+from factorbus.solver.formulas.groups import Dual
+from factorbus.solver.formulas.terms import DOUBLE, INTEGER, LANES, WIDE, Code, Operand, Term
+from factorbus.solver.kernels.jit.compile import ir
+from factorbus.solver.kernels.model import layout as at
+
+# A residual beyond it, or a slope, is no number to add to a sum of squares.
+MOST_RESIDUAL = 1e12
+NAME = "factorbus_residual"
+
+_NUMBER, _WORD, _BITS = DOUBLE.as_pointer(), INTEGER.as_pointer(), ir.VectorType(ir.IntType(1), LANES)
+
+
+def residual_code(declared: Declaration) -> str:
+    """The module with the function."""
+    module = ir.Module(NAME)
+    kind = ir.FunctionType(INTEGER, [_NUMBER, _WORD, _WORD, _NUMBER, _NUMBER, INTEGER])
+    function = ir.Function(module, kind, NAME)
+    x, var, fac, z, out, slopes = function.args
+    entry, loop, end = (function.append_basic_block(name) for name in ("numbers", "slopes", "end"))
+    at_entry, in_loop, at_end = map(ir.IRBuilder, (entry, loop, end))
+    code = Code(module, at_entry, in_loop)
+
+    # 1. What is known: the variables, with a slope of 1 at each of their scalars, and what is measured.
+    blocks = -(-declared.scalars // LANES)
+    block, all_within = in_loop.phi(INTEGER, "block"), in_loop.phi(_BITS, "within")
+    known: list[Dual] = []
+    scalar = 0
+    for n, kind in enumerate(declared.types[: len(declared.variables)]):
+        v = at_entry.load(at_entry.gep(fac, [INTEGER(at.F_I if n == 0 else (n - 1) * at.F_WIDTH + at.F_J)]))
+        row = at_entry.mul(v, INTEGER(at.V_WIDTH))
+        place = at_entry.load(at_entry.gep(var, [at_entry.add(row, INTEGER(at.V_AT))]))
+        d = [_seed(code, block, scalar + c) for c in range(tangent_size(kind))]
+        known.append(Dual(_loaded(code, x, place, value_size(kind)), d))
+        scalar += tangent_size(kind)
+    measured = declared.measured
+    known.append(Dual(_loaded(code, z, INTEGER(0), value_size(measured)), [0.0] * tangent_size(measured)))
+
+    # 2. Each node of those before it.
+    for node in declared.nodes:
+        of = [known[k] for k in node.of]
+        known.append(_carry_out(node, [declared.types[k] for k in node.of], of))
+
+    # 3. The residual, and whether it is one.
+    residual, within = known[-1], ir.IntType(1)(1)
+    for a, number in enumerate(residual.v):
+        value = _value(number, DOUBLE)
+        at_entry.store(value, at_entry.gep(out, [INTEGER(a)]))
+        within = at_entry.and_(within, _is_within(code, at_entry, value, DOUBLE))
+    at_entry.cbranch(at_entry.icmp_signed("!=", slopes, INTEGER(0)), loop, end)
+
+    # 4. The Jacobian, from the last block of scalars on.
+    now: Any = all_within
+    column = in_loop.mul(block, INTEGER(LANES))
+    dim = len(residual.v)
+    for a, slope in enumerate(residual.d):
+        value = _value(slope, WIDE)
+        here = in_loop.gep(out, [in_loop.add(column, INTEGER(dim + a * declared.scalars))])
+        in_loop.store(value, in_loop.bitcast(here, WIDE.as_pointer()), align=8)
+        now = in_loop.and_(now, _is_within(code, in_loop, value, WIDE))
+    following = in_loop.sub(block, INTEGER(1))
+    block.add_incoming(INTEGER(blocks - 1), entry)
+    block.add_incoming(following, loop)
+    all_within.add_incoming(ir.Constant(_BITS, [1] * LANES), entry)
+    all_within.add_incoming(now, loop)
+    lanes = in_loop.bitcast(now, ir.IntType(LANES))
+    also = in_loop.icmp_unsigned("==", lanes, ir.Constant(ir.IntType(LANES), (1 << LANES) - 1))
+    in_loop.cbranch(in_loop.icmp_signed(">=", following, INTEGER(0)), loop, end)
+
+    # 5. Both are numbers.
+    slopes_within = at_end.phi(ir.IntType(1))
+    slopes_within.add_incoming(ir.IntType(1)(1), entry)
+    slopes_within.add_incoming(also, loop)
+    at_end.ret(at_end.zext(at_end.and_(within, slopes_within), INTEGER))
+    return str(module)
+
+
+def _loaded(code: Code, first: Any, place: Any, count: int) -> list[Operand]:
+    builder = code.numbers
+    return [code.number(builder.load(builder.gep(first, [builder.add(place, INTEGER(c))]))) for c in range(count)]
+
+
+def _seed(code: Code, block: Any, scalar: int) -> Term:
+    """1 in the lane of this scalar, where it is in the block."""
+    builder = code.slopes
+    here = builder.icmp_signed("==", block, INTEGER(scalar // LANES))
+    one = [1.0 if lane == scalar % LANES else 0.0 for lane in range(LANES)]
+    return code.slope(builder.select(here, ir.Constant(WIDE, one), ir.Constant(WIDE, [0.0] * LANES)))
+
+
+def _value(operand: Operand, kind: Any) -> Any:
+    if isinstance(operand, Term):
+        return operand.value
+    return ir.Constant(kind, [operand] * LANES if kind is WIDE else operand)
+
+
+def _is_within(code: Code, builder: Any, value: Any, kind: Any) -> Any:
+    name = "llvm.fabs.f64" if kind is DOUBLE else f"llvm.fabs.v{LANES}f64"
+    known = code.module.globals.get(name) or ir.Function(code.module, ir.FunctionType(kind, [kind]), name)
+    most = ir.Constant(kind, MOST_RESIDUAL if kind is DOUBLE else [MOST_RESIDUAL] * LANES)
+    return builder.fcmp_ordered("<=", builder.call(known, [value]), most)
+
+
+def _carry_out(node: ExpressionNode, kinds: Sequence[Type], of: Sequence[Dual]) -> Dual:
+    if node.operation == CONSTANT:
+        return Dual(list(node.numbers), [0.0] * len(node.numbers))
+    return _DO[node.operation](kinds, [int(number) for number in node.numbers], *of)
+
+
+def _plain(function: Callable[..., Dual]) -> Callable[..., Dual]:
+    return lambda _kinds, _numbers, *of: function(*of)
+
+
+def _of_group(function: Callable[..., Dual]) -> Callable[..., Dual]:
+    return lambda kinds, _numbers, *of: function(kinds[0], *of)
+
+
+def _part(_kinds: Sequence[Type], numbers: Sequence[int], a: Dual) -> Dual:
+    first, count = numbers
+    return Dual(a.v[first : first + count], a.d[first : first + count])
+
+
+def _logarithm(kinds: Sequence[Type], _numbers: Sequence[int], a: Dual) -> Dual:
+    if kinds[0] == SO3:
+        return groups.log(a)
+    where = groups.position(str(kinds[0]), a)
+    turn = Dual(a.v[2:], a.d[2:]) if len(a.v) == 3 else groups.log(Dual(a.v[3:], a.d[3:]))
+    return _joined(where, turn)
+
+
+def _joined(*of: Dual) -> Dual:
+    return Dual([x for dual in of for x in dual.v], [x for dual in of for x in dual.d])
+
+
+def _added(sign: float) -> Callable[[Dual, Dual], Dual]:
+    return lambda a, b: Dual(*([x + sign * y for x, y in zip(*parts, strict=True)] for parts in zip(a, b, strict=True)))
+
+
+_DO: dict[str, Callable[..., Dual]] = {
+    "compose": _of_group(groups.compose_dual),
+    "inverse": _of_group(groups.inverse_dual),
+    "act": lambda kinds, _numbers, a, b: groups.rotate(kinds[0], a, b, moves=kinds[0] != SO3),
+    "rotate": _of_group(groups.rotate),
+    "position": _of_group(groups.position),
+    "rotation": _plain(lambda a: Dual(a.v[3:], a.d[3:])),
+    "heading": _plain(lambda a: Dual(a.v[2:], a.d[2:])),
+    "pose": _plain(groups.pose_dual),
+    "log": _logarithm,
+    "exp": _plain(groups.exp),
+    "vector_part": _plain(groups.vector_part),
+    "norm": _plain(vectors.norm),
+    "dot": _plain(vectors.dot),
+    "cross": _plain(vectors.cross_dual),
+    "atan2": _plain(vectors.atan2),
+    "sqrt": _plain(vectors.sqrt),
+    "sin": _plain(vectors.sin),
+    "cos": _plain(vectors.cos),
+    "wrap": _plain(lambda a: Dual([groups.wrapped_angle(a.v[0])], a.d)),
+    "select": _plain(vectors.select),
+    "add": _plain(_added(1.0)),
+    "subtract": _plain(_added(-1.0)),
+    "negate": _plain(lambda a: Dual(*([-x for x in part] for part in a))),
+    "multiply": _plain(vectors.multiply_dual),
+    "divide": _plain(vectors.divide),
+    "part": _part,
+    "vector": _plain(_joined),
+}
