@@ -17,7 +17,7 @@ from factorbus.solver.kernels.jit.machine_code import MachineCode, TooManyFuncti
 from factorbus.solver.kernels.model import expression_layout as at
 
 # Whose graphs are gone are kept for a while: what a graph was copied from may still be read.
-_KEPT = 1024
+_KEPT = 256
 
 
 class OwnCode:

@@ -5,6 +5,7 @@ number that is the same in every process, and a table, at an address that kernel
 """
 
 import ctypes
+import functools
 import weakref
 from typing import Any
 
@@ -35,16 +36,25 @@ class MachineCode:
     def __init__(self, number: int, text: str, name: str) -> None:
         """The function `name` of the module `text`.  Raises TooManyFunctions."""
         with global_compiler_lock:
-            module = llvm.parse_assembly(text)
-            target = llvm.Target.from_default_triple().create_target_machine(
-                cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
-            )
-            self._engine = llvm.create_mcjit_compiler(module, target)
+            # Compiled apart: an engine that compiles keeps 0.8 MB, one that is given what is compiled 8 kB.
+            compiled = _this_processor().emit_object(llvm.parse_assembly(text))
+            self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _processor())
+            self._engine.add_object_file(llvm.ObjectFileRef.from_data(compiled))
             self._engine.finalize_object()
             slot = _slot_for(number)
             _TABLE[slot, _ADDRESS] = self._engine.get_function_address(name)
             _TABLE[slot, _NUMBER] = number
         weakref.finalize(self, _leave, slot, self._engine).atexit = False
+
+
+def _processor() -> Any:
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
+    )
+
+
+# For all that is compiled, one at a time.
+_this_processor = functools.cache(_processor)
 
 
 def _slot_for(number: int) -> int:
