@@ -94,6 +94,34 @@ def test_a_formula_with_the_number_of_another_is_refused(monkeypatch: pytest.Mon
     assert own_code_of(first.formula) is first
 
 
+def test_a_choice_between_what_does_not_change_has_no_slope() -> None:
+    """Zeros of either sign are one."""
+    choice = "select(z,negate(z),z)"
+    assert value_in(solved(f"chosen(a:vector1,z:1)=add(a,{choice})")) == pytest.approx(6.0)
+
+
+def test_chi2_is_that_of_the_residual_where_a_slope_is_no_number() -> None:
+    """By whichever way it is summed: 1e12 √a has a slope beyond 1e12 where a is below a quarter."""
+    steep = "steep(a:vector1,z:1)=subtract(multiply(sqrt(a),1e12),z)"
+    solver, key = Solver(), np.array([[1]])
+    solver.stage(
+        Batch(
+            (Variables("vector1", np.array([1]), np.array([[0.3]])),),
+            (
+                Factors(steep, key, np.array([[4e11]]), np.array([[1e-22]])),
+                Factors("linear_1_vector1", key, np.array([[0.3, 1.0, 0.0]]), np.array([[1.0]])),
+            ),
+        )
+    )
+    for _ in range(3):
+        report = solver.step()
+        a = value_in(solver)
+        assert a < 0.25
+        wanted = 1e-22 * (1e12 * np.sqrt(a) - 4e11) ** 2 + (a - 0.3) ** 2
+        assert report.chi2 == pytest.approx(wanted, rel=1e-6)
+        assert solver.chi2() == pytest.approx(wanted, rel=1e-6)
+
+
 def test_code_is_made_anew_in_another_process() -> None:
     code = own_code_of(SCALED.format("3"))
     assert pickle.loads(pickle.dumps(code)) is code

@@ -13,7 +13,7 @@ from factorbus.proto.expressions.operations import SE3, SO3, value_size
 from factorbus.solver import errors
 from factorbus.solver.formulas.residual import NAME, residual_code
 from factorbus.solver.kernels.jit.compile import F64
-from factorbus.solver.kernels.jit.machine_code import MachineCode, TooManyFunctions
+from factorbus.solver.kernels.jit.machine_code import MachineCode, TooManyFunctions, one_at_a_time
 from factorbus.solver.kernels.model import expression_layout as at
 
 # Whose graphs are gone are kept for a while: what a graph was copied from may still be read.
@@ -55,16 +55,17 @@ def own_code_of(formula: str) -> OwnCode:
 
     Raises KindTaken: another formula of the process has its number; TooLarge: the process has no room for another.
     """
-    if (there := _THERE.get(formula)) is not None:
-        return there
-    number = _number_of(formula)
-    for other in _THERE.values():
-        if other.number == number:
-            raise errors.KindTaken(formula, other.formula, formula)
-    try:
-        return _made(formula)
-    except TooManyFunctions:
-        raise errors.TooLarge("the process", len(_THERE) + 1, len(_THERE), "own kinds") from None
+    with one_at_a_time:  # else two threads could have two formulas of one number
+        if (there := _THERE.get(formula)) is not None:
+            return there
+        number = _number_of(formula)
+        for other in _THERE.values():
+            if other.number == number:
+                raise errors.KindTaken(formula, other.formula, formula)
+        try:
+            return _made(formula)
+        except TooManyFunctions:
+            raise errors.TooLarge("the process", len(_THERE) + 1, len(_THERE), "own kinds") from None
 
 
 @lru_cache(maxsize=256)

@@ -1,6 +1,6 @@
 """The function of a kind in LLVM's language: its residual, and the Jacobian of that.  MATH §3.11.
 
-    function(x, var, fac, z, out, slopes) -> 1 where all of r and J are numbers of at most MOST_RESIDUAL, else 0
+    function(x, var, fac, z, out, slopes) -> NO_NUMBER, RESIDUAL or BOTH: what is a number of at most MOST_RESIDUAL
 
 x: all values; var: the table of variables; fac: the rows of the factor; z: what is measured; out: r
 (dim,), and behind it J (dim, scalars), row by row, written where `slopes` is not 0, with room for a vector register
@@ -21,6 +21,7 @@ from factorbus.solver.formulas.groups import Dual
 from factorbus.solver.formulas.terms import DOUBLE, INTEGER, LANES, WIDE, Code, Operand, Term
 from factorbus.solver.kernels.jit.compile import ir
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.expressions import BOTH, NO_NUMBER, RESIDUAL
 
 # A residual beyond it, or a slope, is no number to add to a sum of squares.
 MOST_RESIDUAL = 1e12
@@ -85,11 +86,12 @@ def residual_code(declared: Declaration) -> str:
     also = in_loop.icmp_unsigned("==", lanes, ir.Constant(ir.IntType(LANES), (1 << LANES) - 1))
     in_loop.cbranch(in_loop.icmp_signed(">=", following, INTEGER(0)), loop, end)
 
-    # 5. Both are numbers.
+    # 5. Which of both are numbers.
     slopes_within = at_end.phi(ir.IntType(1))
-    slopes_within.add_incoming(ir.IntType(1)(1), entry)
+    slopes_within.add_incoming(ir.IntType(1)(0), entry)
     slopes_within.add_incoming(also, loop)
-    at_end.ret(at_end.zext(at_end.and_(within, slopes_within), INTEGER))
+    found = at_end.select(slopes_within, INTEGER(BOTH), INTEGER(RESIDUAL))
+    at_end.ret(at_end.select(within, found, INTEGER(NO_NUMBER)))
     return str(module)
 
 

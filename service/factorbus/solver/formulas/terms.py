@@ -183,8 +183,8 @@ def pick(a: Operand, comparison: str, b: Operand, yes: Operand, no: Operand) -> 
     """`yes` where a `comparison` b, of numbers, else `no`; `yes` and `no` are numbers or slopes."""
     if not isinstance(a, Term) and not isinstance(b, Term):
         return yes if {"<": a < b, ">=": a >= b, ">": a > b}[comparison] else no
-    if not isinstance(yes, Term) and not isinstance(no, Term) and _identity(yes) == _identity(no):
-        return yes
+    if not isinstance(yes, Term) and not isinstance(no, Term) and yes == no:
+        return yes  # zeros of either sign too: a slope that is 0 is none
     code = next(term.code for term in (a, b) if isinstance(term, Term))
     holds = code.once(f"fcmp {comparison}", False, (a, b), lambda builder, of: builder.fcmp_ordered(comparison, *of))
     wide = any(isinstance(term, Term) and term.wide for term in (yes, no))

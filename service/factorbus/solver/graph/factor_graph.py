@@ -85,7 +85,7 @@ class FactorGraph(Arenas):
         self._rows = Rows()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Whoever says which own kinds the graph has holds their code."""
+        """With its own kinds a graph holds their code."""
         super().__setattr__(name, value)
         if name == "own":
             self.own_code = tuple(map(own_code_of, value))

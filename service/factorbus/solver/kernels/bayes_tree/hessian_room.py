@@ -8,9 +8,8 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.machine_code import first_of
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.expressions import BEHIND, evaluate_own
+from factorbus.solver.kernels.model.expressions import BEHIND, evaluate_linear
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_one_of_many, residual_size, rows_of
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.many import Many
@@ -65,8 +64,7 @@ def keep_jacobian(f: int, graph: Graph, tree: Tree, many: Many) -> None:
     if fac[f, at.F_KIND] != at.OWN:
         copy_linear(many, tree.hessian[k : k + size])
         return
-    if evaluate_own(True, f, var, fac, tree.lin[0], graph.payload, first_of(tree.hessian, k)) > 0.0:
-        tree.hessian[k : k + size] = 0.0
+    evaluate_linear(f, var, fac, tree.lin[0], graph.payload, tree.hessian[k : k + size])
 
 
 @part

@@ -13,10 +13,9 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree.hessian_room import jacobian_at
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, part
-from factorbus.solver.kernels.jit.machine_code import first_of
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.expression_layout import X_BEFORE
-from factorbus.solver.kernels.model.expressions import BEHIND, evaluate_own, information_square
+from factorbus.solver.kernels.model.expressions import BEHIND, evaluate_linear, information_square
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, loss_code, residual_size
 from factorbus.solver.kernels.model.losses import loss_of
 from factorbus.solver.kernels.model.records import Graph
@@ -36,9 +35,7 @@ def exact_error_of_own(f: int, graph: Graph, tree: Tree) -> tuple[float, float, 
     w = np.empty(forces + dim)
 
     # 1. The residual, its Jacobian, and χ², now; the weights of its loss, now and where it is linearized.
-    chi2 = evaluate_own(True, f, var, fac, graph.values, payload, first_of(w, 0))
-    if chi2 > 0.0:
-        w[:delta] = 0.0
+    chi2 = evaluate_linear(f, var, fac, graph.values, payload, w[:delta])
     root = root_was = 1.0
     loss = loss_code(f, fac)
     if loss == at.NO_LOSS:

@@ -15,6 +15,8 @@ from numba.core.compiler_lock import global_compiler_lock
 
 from factorbus.solver.kernels.jit.compile import DISABLED, inline_kernel, intrinsic, ir, types
 
+# LLVM compiles for one thread at a time.
+one_at_a_time = global_compiler_lock
 _SLOTS = 1 << 16  # a power of 2
 _FREE, _LEFT = 0, -1  # a slot that was never used, and one that was: a search goes on there
 _NUMBER, _ADDRESS = 0, 1
@@ -35,7 +37,7 @@ class MachineCode:
 
     def __init__(self, number: int, text: str, name: str) -> None:
         """The function `name` of the module `text`.  Raises TooManyFunctions."""
-        with global_compiler_lock:
+        with one_at_a_time:
             # Compiled apart: an engine that compiles keeps 0.8 MB, one that is given what is compiled 8 kB.
             compiled = _this_processor().emit_object(llvm.parse_assembly(text))
             self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _processor())
@@ -66,7 +68,7 @@ def _slot_for(number: int) -> int:
 
 
 def _leave(slot: int, engine: Any) -> None:
-    with global_compiler_lock:
+    with one_at_a_time:
         _TABLE[slot, _NUMBER] = _LEFT
         engine.close()
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part, vector_lanes
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.machine_code import address_of_function, call, first_of
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import INACTIVE_CHI2
@@ -10,24 +10,27 @@ from factorbus.solver.kernels.model.expression_layout import X_BEFORE, X_NUMBER,
 from factorbus.solver.kernels.model.factor_rows import loss_code, residual_size
 from factorbus.solver.kernels.model.losses import loss_of
 
-# Numbers behind a Jacobian that are written, and mean nothing.
-BEHIND = vector_lanes()
+# Numbers behind a Jacobian that may be written, and mean nothing: as many as the widest vector register of any
+# processor has, for a state may be gone on from on another one.
+BEHIND = 8
+# What is of a factor: its residual; and its slopes, too.
+NO_NUMBER, RESIDUAL, BOTH = 0, 1, 3
 
 
 @part
-def evaluate_own(slopes: bool, f: int, var: I64, fac: I64, x: F64, payload: F64, out: int) -> float:
+def evaluate_own(slopes: bool, f: int, var: I64, fac: I64, x: F64, payload: F64, out: int) -> int:
     """Residual and Jacobian of the factor of an own kind that begins at row f, written where the address `out` is:
     r (dim,), then J (dim, Σ d), row by row, with room for BEHIND numbers after it; without `slopes` r alone.
 
-    Where the residual is no number, or none that a square can be taken of, INACTIVE_CHI2 is given, which stands for
-    χ², and what is written means nothing; else 0.
+    Gives BOTH; RESIDUAL where a slope is no number, or was not asked for; NO_NUMBER where r is none, or none that a
+    square can be taken of.  What is no number means nothing.
     """
     p = fac[f, at.F_AT]
-    address, good, row = address_of_function(int(payload[p + X_NUMBER])), 0, f * at.F_WIDTH
-    if address != 0:
-        z = first_of(payload, p + X_WIDTH)
-        good = call(address, first_of(x, 0), first_of(var, 0), first_of(fac, row), z, out, 1 if slopes else 0)
-    return 0.0 if good != 0 else INACTIVE_CHI2
+    address, row = address_of_function(int(payload[p + X_NUMBER])), f * at.F_WIDTH
+    if address == 0:
+        return NO_NUMBER
+    z = first_of(payload, p + X_WIDTH)
+    return call(address, first_of(x, 0), first_of(var, 0), first_of(fac, row), z, out, 1 if slopes else 0)
 
 
 @part
@@ -35,12 +38,22 @@ def chi2_of_own(f: int, var: I64, fac: I64, x: F64, payload: F64) -> float:
     """χ² of the factor of an own kind that begins at row f."""
     dim, loss = residual_size(f, fac), loss_code(f, fac)
     r, p = np.empty(dim), fac[f, at.F_AT] + int(payload[fac[f, at.F_AT] + X_BEFORE])
-    square = evaluate_own(False, f, var, fac, x, payload, first_of(r, 0))
-    if square == 0.0:
-        square = information_square(dim, p, payload, r)
+    is_number = evaluate_own(False, f, var, fac, x, payload, first_of(r, 0)) != NO_NUMBER
+    square = information_square(dim, p, payload, r) if is_number else INACTIVE_CHI2
     if loss != at.NO_LOSS:
         square, _ = loss_of(loss, square, payload[p + dim * (dim + 1) // 2])
     return square
+
+
+@part
+def evaluate_linear(f: int, var: I64, fac: I64, x: F64, payload: F64, out: F64) -> float:
+    """As `evaluate_own` with slopes, into an array; where r is no number r and J are 0 and INACTIVE_CHI2 is given,
+    which is added to χ², else 0.  Where only slopes are none, J is 0: χ² is a matter of r alone.
+    """
+    found = evaluate_own(True, f, var, fac, x, payload, first_of(out, 0))
+    if found != BOTH:
+        out[0 if found == NO_NUMBER else residual_size(f, fac) :] = 0.0
+    return INACTIVE_CHI2 if found == NO_NUMBER else 0.0
 
 
 @inline_kernel

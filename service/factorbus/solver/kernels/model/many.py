@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part, shared_kernel, types
-from factorbus.solver.kernels.jit.machine_code import first_of
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.composed import composed
-from factorbus.solver.kernels.model.expressions import BEHIND, chi2_of_own, evaluate_own
+from factorbus.solver.kernels.model.expressions import BEHIND, chi2_of_own, evaluate_linear
 from factorbus.solver.kernels.model.factor_rows import (
     count_ends,
     end_of,
@@ -66,11 +65,7 @@ def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
     if kind == at.OWN:
         room = np.empty(dim * (start[ends] + 1) + BEHIND)
         many = Many(room[:dim], room[dim : dim * (start[ends] + 1)].reshape(dim, start[ends]), start)
-        more = evaluate_own(True, f, var, fac, x, payload, first_of(room, 0))
-        if more > 0.0:
-            many.r[:] = 0.0
-            many.J[:] = 0.0
-        return more, many
+        return evaluate_linear(f, var, fac, x, payload, room), many
     many = Many(np.zeros(max(dim, at.R_SIZE)), np.zeros((dim, start[ends])), start)
     if kind == at.LINEAR:
         linear(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
