@@ -96,8 +96,11 @@ def test_a_formula_with_the_number_of_another_is_refused(monkeypatch: pytest.Mon
 
 def test_a_choice_between_what_does_not_change_has_no_slope() -> None:
     """Zeros of either sign are one."""
-    choice = "select(z,negate(z),z)"
-    assert value_in(solved(f"chosen(a:vector1,z:1)=add(a,{choice})")) == pytest.approx(6.0)
+    solver, formula = Solver(), "chosen(a:vector1,z:1)=vector(subtract(a,z),select(z,negate(z),z))"
+    variables = (Variables("vector1", np.array([1]), np.array([[1.0]])),)
+    solver.stage(Batch(variables, (Factors(formula, np.array([[1]]), np.array([[6.0]]), np.array([[1.0, 0.0, 1.0]])),)))
+    assert solver.step().chi2 == pytest.approx(36.0)
+    assert value_in(solver) == pytest.approx(6.0)
 
 
 def test_chi2_is_that_of_the_residual_where_a_slope_is_no_number() -> None:
