@@ -136,3 +136,27 @@ def test_a_formula_of_too_many_numbers_is_refused_before_code_is_made() -> None:
     many = 64 * "multiply(" + "z" + 64 * ",a)"
     with pytest.raises(BadExpression, match=str(MOST_RESULTS)):
         read_formula(f"much(a:vector1,z:64)={many}")
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        "sqrt([0])",
+        "norm([0,0])",
+        "atan2([0],[0])",
+        "part(log(exp([0,0,0])),0,1)",
+        "part(log(exp([3,0,0])),0,1)",
+        "select([1],[0],divide([1],[0]))",
+        "multiply(sin(multiply([1e200],[1e200])),[0])",
+        "wrap(divide([1],[0]))",
+        "cos(sqrt([-1]))",
+    ],
+)
+def test_what_is_known_is_computed_as_code_is_made_whatever_it_is(known: str) -> None:
+    """A formula that divides by nothing, or whose numbers are none, is taken or refused, and no error of Python's."""
+    try:
+        solver = solved(f"known(a:vector1,z:1)=subtract(add(a,{known}),z)")
+    except errors.NotFinite:
+        assert "[1e200]" in known or "wrap" in known
+        return
+    assert np.isfinite(value_in(solver))

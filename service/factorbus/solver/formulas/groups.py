@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from factorbus.solver.formulas.terms import Operand, angle_of, cosine, floor, pick, root, sine
+from factorbus.solver.formulas.terms import Operand, angle_of, cosine, floor, over, pick, root, sine
 from factorbus.solver.kernels.model.se3 import HALF_TURN, HALF_TURN_SLOPE
 
 _TWO_PI = 2.0 * math.pi
@@ -107,8 +107,8 @@ def log(a: Dual) -> Dual:
     length = root(square)
     half = angle_of(length, w)
     # ½θ = sin ½θ (1 + sin² ½θ / 6)
-    scale = pick(square, "<", _SMALL, 2.0 + square / 3.0, 2.0 * half / length)
-    second = pick(square, "<", _SMALL, 1.0 / 12.0, (1.0 - half * w / length) / (4.0 * half * half))
+    scale = pick(square, "<", _SMALL, 2.0 + square / 3.0, over(2.0 * half, length))
+    second = pick(square, "<", _SMALL, 1.0 / 12.0, over(1.0 - over(half * w, length), 4.0 * half * half))
     phi = [scale * x, scale * y, scale * z]
     return Dual(phi, _by_powers(0.5, second, phi, a.d))
 
@@ -118,10 +118,10 @@ def exp(a: Dual) -> Dual:
     square = a.v[0] * a.v[0] + a.v[1] * a.v[1] + a.v[2] * a.v[2]
     angle = root(square)
     half = sine(0.5 * angle)
-    scale = pick(square, "<", _SMALL, 0.5 - square / 48.0, half / angle)
+    scale = pick(square, "<", _SMALL, 0.5 - square / 48.0, over(half, angle))
     w = pick(square, "<", _SMALL, 1.0 - square / 8.0, cosine(0.5 * angle))
-    first = pick(square, "<", _SMALL, 0.5 - square / 24.0, 2.0 * half * half / square)
-    second = pick(square, "<", _SMALL, 1.0 / 6.0, (angle - sine(angle)) / (angle * square))
+    first = pick(square, "<", _SMALL, 0.5 - square / 24.0, over(2.0 * half * half, square))
+    second = pick(square, "<", _SMALL, 1.0 / 6.0, over(angle - sine(angle), angle * square))
     return Dual([*(scale * x for x in a.v), w], _by_powers(-first, second, a.v, a.d))
 
 
@@ -157,7 +157,7 @@ def _product(a: Sequence[Operand], b: Sequence[Operand]) -> list[Operand]:
 
 
 def _unit(q: Sequence[Operand]) -> list[Operand]:
-    scale = 1.0 / root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    scale = over(1.0, root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
     return [scale * x for x in q]
 
 

@@ -1,7 +1,8 @@
 """Numbers of a formula while its code is made: an operator adds an instruction, once for the same operands.
 
 A term is a number, or one that a vector register has for several scalars of the variables at once: a slope.  What is
-known is computed here; a slope that is 0 needs no instruction, and neither does what is multiplied by it.
+known is computed here; a slope that is 0 needs no instruction, and neither does what is multiplied by it.  What is
+divided by what may be known is divided by `over`: numbers of Python raise where one is 0.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import reduce
 
 from factorbus.solver.formulas.groups import Dual, cross_product
-from factorbus.solver.formulas.terms import Operand, angle_of, cosine, pick, plus, root, sine
+from factorbus.solver.formulas.terms import Operand, angle_of, cosine, over, pick, plus, root, sine
 
 
 def _inner(a: Sequence[Operand], b: Sequence[Operand]) -> Operand:
@@ -17,7 +17,7 @@ def _inner(a: Sequence[Operand], b: Sequence[Operand]) -> Operand:
 def norm(a: Dual) -> Dual:
     """‖a‖:  δ = aᵀ δa / ‖a‖."""
     length = root(_inner(a.v, a.v))
-    return Dual([length], [pick(length, ">", 0.0, _inner(a.v, a.d) * (1.0 / length), 0.0)])
+    return Dual([length], [pick(length, ">", 0.0, over(_inner(a.v, a.d), length), 0.0)])
 
 
 def dot(a: Dual, b: Dual) -> Dual:
@@ -37,14 +37,14 @@ def atan2(a: Dual, b: Dual) -> Dual:
     """The angle of (b, a):  δ = (b δa − a δb) / (a² + b²)."""
     y, x = a.v[0], b.v[0]
     square = x * x + y * y
-    along, across = (pick(square, ">", 0.0, part / square, 0.0) for part in (x, y))
+    along, across = (pick(square, ">", 0.0, over(part, square), 0.0) for part in (x, y))
     return Dual([angle_of(y, x)], [along * a.d[0] - across * b.d[0]])
 
 
 def sqrt(a: Dual) -> Dual:
     """√a."""
     value = root(pick(a.v[0], ">", 0.0, a.v[0], 0.0))
-    return Dual([value], [pick(value, ">", 0.0, 0.5 / value, 0.0) * a.d[0]])
+    return Dual([value], [pick(value, ">", 0.0, over(0.5, value), 0.0) * a.d[0]])
 
 
 def sin(a: Dual) -> Dual:
@@ -73,6 +73,6 @@ def multiply_dual(a: Dual, b: Dual) -> Dual:
 
 def divide(a: Dual, b: Dual) -> Dual:
     """a / b, a number:  δ = (δa − (a / b) δb) / b."""
-    by = 1.0 / b.v[0]
+    by = over(1.0, b.v[0])
     value = [x * by for x in a.v]
     return Dual(value, [by * (d - x * b.d[0]) for x, d in zip(value, a.d, strict=True)])
