@@ -153,6 +153,18 @@ def test_a_step_that_says_it_has_not_converged_counts_as_such_and_not_as_untrue(
     assert found["idle_ratio"] == pytest.approx(1.0, abs=1e-6)
 
 
+def test_after_a_step_that_could_not_finish_the_next_ones_go_on_until_it_is_true_that_they_have() -> None:
+    """Along this valley each Gauss-Newton step gains an eighth less than the one before."""
+    solver, judged, said = Solver(), Judge(), list[bool]()
+    for batch in steps_of("late_3d", 300, 223424827)[:50]:
+        solver.stage(batch)
+        judged.take_in(batch)
+        said.append(solver.step().converged)
+        assert not said[-1] or judged.look(solver.estimate()).ratio <= 1.001
+    assert not all(said)
+    assert said[-1]
+
+
 @pytest.mark.parametrize("field", ["chi2", "chi2_before"])
 def test_untrue_reports_are_seen(monkeypatch: pytest.MonkeyPatch, field: str) -> None:
     true_step = Solver.step

@@ -39,8 +39,6 @@ _NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
 _FINISHED_LEFT = 1e-7
 # By what share of χ² a step of Levenberg-Marquardt may lower it that is the last one, where pivots were raised.
 _AT_END = 1e-7
-# Of `converged_share`: what a step that follows one that had not converged may gain, and say that it has.
-_STILL = 0.1
 _ASKED = "asked to settle"
 _CORRECTED = "residuals taken anew in a chord step"
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
@@ -60,7 +58,6 @@ class TreeSteps:
         self._tree = CliqueTree(graph, options)
         self._mark = graph.mark()
         self._first_new, self._batched, self._at_linearization = 0, False, False
-        self._bounded = True  # whether the last step ended within its bound
         self._damping = 0.0  # with which a batch ended that had not converged: the next one goes on from it
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
         self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
@@ -289,11 +286,7 @@ class TreeSteps:
         converged = result.converged if result else error <= allowed
         if not result and self._tree.raised:
             converged &= self._is_within(share, chi2)
-        bounded = converged
-        if not result and not self._bounded:  # in a long valley a step gains hardly less than the one before
-            converged &= chi2_before - chi2 <= _STILL * share * (chi2 + LEAST_CHI2)
         converged = converged or (not result and not self.unfinished)
-        self._bounded = bounded
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (

@@ -48,11 +48,14 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns) -> int:
     it was then.
     """
     raw, groups, problem = (batch.raw, batch.groups, None) if isinstance(batch, Columns) else locate_columns(batch)
-    mark, first = graph.mark(), graph.next_id
-    own = graph.own
+    mark, own = graph.mark(), graph.own
+    first = mark[at.FACTORS] + graph.id_shift
     try:
-        if not isinstance(batch, Columns) and any("(" in group.kind for group in batch.factors):
-            own_kinds.take_own_kinds(graph, batch)
+        if not isinstance(batch, Columns):
+            for group in batch.factors:
+                if "(" in group.kind:
+                    own_kinds.take_own_kinds(graph, batch)
+                    break
         fault, g, row, rest = admit_groups(raw, groups, graph.array_table)
         if fault == gt.NO_LIMITS:
             raw, groups, lens = limit_lenses(raw, groups)
@@ -67,7 +70,8 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns) -> int:
             raise problem
         if fault == gt.COMPOSED_OUT_OF_BOUNDS:
             raise value_out_of_bounds(graph, row)
-        graph.name_rows(mark[at.FACTORS], first)
+        if graph.counts.item(at.MEMBERS):
+            graph.name_rows(mark[at.FACTORS], first)
         if rest:
             _finish(graph, groups, mark, rest)
     except BaseException:

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from factorbus.proto import inertial
 from factorbus.proto.kinds import FACTOR_KINDS as WIRE_KINDS
 from factorbus.solver import errors
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS, LENS_AT, LOSSES
@@ -27,7 +26,7 @@ _END = (gt.END,) + (0,) * (gt.G_WIDTH - 1)
 _WORD = 8
 _ABSENT = (None, ())  # the form of a column that is not there
 _NO_SIZES = (0, 0, 0, gt.NOWHERE, gt.NOWHERE, 0)  # the last columns of a group whose kind says what its sizes are
-_SIZED = "linear_", inertial.PREFIX  # what the names of the others begin with, but for formulas
+_LISTED = frozenset(WIRE_KINDS.keys())  # all others are of families, or are none
 
 
 class Columns(NamedTuple):
@@ -55,7 +54,7 @@ def locate_columns(batch: BatchLike) -> tuple[bytes, I64, errors.SolverError | N
     for group in batch.factors:
         keys, measured, information = group.keys, group.measured, group.information
         columns += (keys, measured, information)
-        if group.kind.startswith(_SIZED) or "(" in group.kind:
+        if group.kind not in _LISTED:
             columns += _columns_of_kind(group.kind)
         form += (group.kind, group.loss)
         if type(keys) is type(measured) is type(information) is ndarray:

@@ -191,10 +191,8 @@ class FactorGraph(Arenas):
     def name_rows(self, first: int, first_id: int) -> None:
         """Give their ids to the rows from `first` on, which came last; the first of them gets `first_id`.
 
-        Where any factor has several rows, all ids are listed: those rows have the same.
+        For a graph of which a factor has several rows: then all ids are listed, since those rows have the same.
         """
-        if not self.counts[at.MEMBERS]:
-            return
         rows = int(self.counts[at.FACTORS])
         ids = first_id - 1 + np.cumsum(is_first(self.fac[first:rows]))
         if self._unlisted is None and self.ids.size < first:

@@ -105,7 +105,7 @@ def correct_se2(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     i, j, r, A, B = fac[f, at.F_I], fac[f, at.F_J], scratch.r, scratch.H[0], scratch.H[1]
     evaluate_apart(f, var, fac, tree.lin[0], p, r, A, B)
     phi = turn_since_linearized(i, var, tree.scalars[0])
-    x, y, _ = missed_se2(var[i, at.V_AT], var[j, at.V_AT], phi, graph.values, tree.lin[0])
+    x, y, _, _ = missed_se2(var[i, at.V_AT], var[j, at.V_AT], phi, graph.values, tree.lin[0])
     row[tl.E_MISSED], row[tl.E_MISSED + 1] = x, y
     # In the frame of the residual, to which A takes translations of the first pose, turned about.
     c, s = tree.turns[i, tl.U_COS], tree.turns[i, tl.U_SIN]

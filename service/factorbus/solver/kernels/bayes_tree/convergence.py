@@ -13,6 +13,7 @@ FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than
 LARGE_GAIN = 0.05  # of χ², in one round or all,
 AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
 MOST_LEFT = 0.5  # of the Σ error² that is allowed: what a chord step may leave, as it counts as a round
+SLOW = 0.1  # times as much error² is allowed after a step that had not converged
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -22,11 +23,11 @@ def goes_on(weighted_error: float, settings: F64, state: I64, totals: F64) -> bo
 
     weighted_error: as `measure` gives it
     """
-    rounds = state[tl.S_ROUNDS]
+    rounds, goes_on_slowly = state[tl.S_ROUNDS], state[tl.S_CONTINUES] != 0 or state[tl.S_SLOW] != 0
     if state[tl.S_ONCE] != 0:
         return False
     if totals[tl.T_ERROR] > allowed(settings, state, totals):
-        return rounds < (settings[tl.P_MAX_ROUNDS] if state[tl.S_CONTINUES] != 0 else MOST_ROUNDS)
+        return rounds < (settings[tl.P_MAX_ROUNDS] if goes_on_slowly else MOST_ROUNDS)
     return (
         state[tl.S_CONTINUES] == 0
         and weighted_error > settings[tl.P_SAME_STEP_SHARE]
@@ -71,9 +72,12 @@ def allowed(settings: F64, state: I64, totals: F64) -> float:
 
 @inline_kernel
 def converged_error(settings: F64, state: I64, totals: F64) -> float:
-    """The Σ error² up to which the step has converged.  (9.32)"""
+    """The Σ error² up to which the step has converged: less after one that had not, since along a valley a Gauss-Newton
+    step takes hardly less off χ² than the one before.  (9.32)
+    """
     chi2 = totals[tl.T_CHI2] + LEAST_CHI2
     share = settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS] + state[tl.S_CHORDS], 1)
+    share *= SLOW if state[tl.S_SLOW] != 0 else 1.0
     return share * chi2 * (AFTER_LARGE_GAIN if totals[tl.T_GAINED] > LARGE_GAIN * chi2 else 1.0)
 
 
@@ -82,6 +86,7 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
     """What is to be done after the step, and what the optimum is at least."""
     chi2 = totals[tl.T_CHI2]
     totals[tl.T_ALLOWED] = converged_error(settings, state, totals)
+    state[tl.S_SLOW] = 1 if totals[tl.T_ERROR] > totals[tl.T_ALLOWED] else 0
     state[tl.S_AFTER] = 0
     if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * totals[tl.T_BEFORE] + LEAST_CHI2:
         state[tl.S_AFTER] += tl.WORSE

@@ -122,8 +122,8 @@ def heading_of(v: int, planar: bool, var: I64, delta: F64, values: F64, turns: F
         theta = load(values, var[v, at.V_AT] + 2)
         return math.cos(theta), math.sin(theta)
     q = angle * angle
-    c = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q / 40320.0)))
-    s = angle * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0 - q / 362880.0))))
+    c = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q * (1.0 / 40320.0))))
+    s = angle * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0 - q * (1.0 / 362880.0)))))
     c0, s0 = turns[v, tl.U_COS], turns[v, tl.U_SIN]
     return c * c0 - s * s0, s * c0 + c * s0
 

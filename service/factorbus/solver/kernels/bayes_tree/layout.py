@@ -145,7 +145,8 @@ S_EDITED = 56  # variables in `moved` whose factors were edited since the last s
 S_EDITED_AT = 57  # the last step that such factors went before
 S_HOLES = 58  # doubles of `hessian` that no factor has any more
 S_CHORDS = 59  # chord steps of the step
-S_FREE = 60  # heads of free lists: numbers, then lists
+S_SLOW = 60  # 1: the last step had not converged after its rounds
+S_FREE = 61  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 

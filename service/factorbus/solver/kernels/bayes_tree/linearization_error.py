@@ -212,37 +212,76 @@ def error_of(
 
     Between poses in space (9.4) and (9.26) stand for (9.33) and (9.34) where they are below that threshold.
     """
-    var, values, kind, second = graph.var, graph.values, graph.fac[f, at.F_KIND], graph.fac[f, at.F_J]
-    node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
-    lin, delta = tree.lin[0], tree.scalars[0]
-    x, y, planar, free = var[v, at.V_AT], var[second, at.V_AT], var[v, at.V_KIND] == at.SE2, var[v, at.V_COLUMN] >= 0
-    phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
-    d, root, moved = factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT], shift_between(planar, x, y, values, lin)
-    lever_error = lever_error_of(root, d, phi, moved)
-    if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
-        shift_error = factor_errors[f, tl.E_SHIFT] * math.sqrt(gap)
-        bound = lever_error + LINKS * shift_error * moved
-        both, marks = LINKS * shift_error * moved > lever_error, bound > threshold
-        if kind == at.BETWEEN_SE2:
-            missed, shift, psi = missed_error_se2(graph, tree, f)
-        else:
-            turn = phi + (turn_of(at.SE3, delta, var[second, at.V_SCALAR]) if var[second, at.V_COLUMN] >= 0 else 0.0)
-            missed, shift, psi = lever_error + turn_error(phi, turn, factor_errors[f, tl.E_TURN]), moved, turn
-            if marks or missed > threshold or factor_errors[f, tl.E_FORM] >= tl.CORRECTED:
-                missed, shift, psi = missed_error_se3(graph, tree, f)
-        leaves = min(shift_error * shift + psi * math.sqrt(chi2), MOST_ERROR)
-        full, error = min(missed + leaves, MOST_ERROR), min(missed + LINKS * shift_error * shift, MOST_ERROR)
+    var, kind, second = graph.var, graph.fac[f, at.F_KIND], graph.fac[f, at.F_J]
+    free = var[v, at.V_COLUMN] >= 0
+    if kind == at.BETWEEN_SE2:
+        error, full, leaves, marks, both = error_between_se2(graph, tree, f, threshold, gap, chi2)
+    elif kind == at.BETWEEN_SE3:
+        error, full, leaves, marks, both = error_between_se3(graph, tree, f, threshold, gap, chi2)
     else:
-        lever_error, shift_error = add_observation(kind, lever_error, root, d, moved, factor_errors[f, tl.E_SHIFT])
+        d, root, moved = lever_and_shift(graph, tree, f, v)
+        phi = turn_of(var[v, at.V_KIND], tree.scalars[0], var[v, at.V_SCALAR]) if free else 0.0
+        lever_error, shift_error = add_observation(
+            kind, lever_error_of(root, d, phi, moved), root, d, moved, tree.factor_errors[f, tl.E_SHIFT]
+        )
         full = error = leaves = min(SEEN * (lever_error + shift_error), MOST_ERROR)
-        both = kind == at.BEARING_RANGE_SE2 or shift_error > lever_error
-        marks = error > threshold
+        both, marks = kind == at.BEARING_RANGE_SE2 or shift_error > lever_error, error > threshold
     if marks:
         if free:
-            mark_pending(v, node, pending, state)
+            mark_pending(v, tree.node, tree.pending, tree.state)
         if (both or not free) and var[second, at.V_COLUMN] >= 0:
-            mark_pending(second, node, pending, state)
+            mark_pending(second, tree.node, tree.pending, tree.state)
     return error, full, leaves
+
+
+@inline_kernel
+def lever_and_shift(graph: Graph, tree: Tree, f: int, v: int) -> tuple[float, float, float]:
+    """d and √ω of factor f, whose first variable is v, and |sⱼ − sᵢ|."""
+    var, row, planar = graph.var, tree.factor_errors[f], graph.var[v, at.V_KIND] == at.SE2
+    x, y = var[v, at.V_AT], var[graph.fac[f, at.F_J], at.V_AT]
+    return row[tl.E_LEVER], row[tl.E_ROOT], shift_between(planar, x, y, graph.values, tree.lin[0])
+
+
+@inline_kernel
+def error_between_se2(
+    graph: Graph, tree: Tree, f: int, threshold: float, gap: float, chi2: float
+) -> tuple[float, float, float, bool, bool]:
+    """Of a factor between plane poses what `error_of` gives, whether a pose waits, and whether both do.
+
+    Most factors are far below the threshold, for which squares do: (a + b + c)² ≤ 3 (a² + b² + c²).
+    """
+    row = tree.factor_errors[f]
+    missed, moved, shift, phi, psi = missed_error_se2(graph, tree, f)
+    d, root, weight, phi = row[tl.E_LEVER], row[tl.E_ROOT], row[tl.E_SHIFT], abs(phi)
+    seen, lever = weight * math.sqrt(gap * shift), root * 0.5 * d * phi * phi
+    turned, linked = root * root * phi * phi * moved, LINKS * LINKS * weight * weight * gap * moved
+    marks = both = False
+    if 3.0 * (lever * lever + turned + linked) > threshold * threshold:
+        lever, link = lever + math.sqrt(turned), math.sqrt(linked)
+        marks, both = lever + link > threshold, link > lever
+    leaves = min(seen + psi * math.sqrt(chi2), MOST_ERROR)
+    return min(missed + LINKS * seen, MOST_ERROR), min(missed + leaves, MOST_ERROR), leaves, marks, both
+
+
+@inline_kernel
+def error_between_se3(
+    graph: Graph, tree: Tree, f: int, threshold: float, gap: float, chi2: float
+) -> tuple[float, float, float, bool, bool]:
+    """The same of a factor between poses in space."""
+    var, row, delta = graph.var, tree.factor_errors[f], tree.scalars[0]
+    v, second = graph.fac[f, at.F_I], graph.fac[f, at.F_J]
+    d, root, moved = lever_and_shift(graph, tree, f, v)
+    phi = turn_of(at.SE3, delta, var[v, at.V_SCALAR]) if var[v, at.V_COLUMN] >= 0 else 0.0
+    turn = phi + (turn_of(at.SE3, delta, var[second, at.V_SCALAR]) if var[second, at.V_COLUMN] >= 0 else 0.0)
+    lever_error, shift_error = lever_error_of(root, d, phi, moved), row[tl.E_SHIFT] * math.sqrt(gap)
+    link = LINKS * shift_error * moved
+    marks, both = lever_error + link > threshold, link > lever_error
+    missed, shift, psi = lever_error + turn_error(phi, turn, row[tl.E_TURN]), moved, turn
+    if marks or missed > threshold or row[tl.E_FORM] >= tl.CORRECTED:
+        missed, shift, psi = missed_error_se3(graph, tree, f)
+    leaves = min(shift_error * shift + psi * math.sqrt(chi2), MOST_ERROR)
+    error = min(missed + LINKS * shift_error * shift, MOST_ERROR)
+    return error, min(missed + leaves, MOST_ERROR), leaves, marks, both
 
 
 @part

@@ -25,21 +25,19 @@ SMALL_TURN = 0.1  # radians: below it the series are exact to rounding
 
 
 @inline_kernel
-def missed_error_se2(graph: Graph, tree: Tree, f: int) -> tuple[float, float, float]:
-    """√ω times (9.33) of factor f between plane poses, less what a chord step has corrected its model by; by how much
-    the second pose has shifted and turned as seen from the first, since both were linearized.
+def missed_error_se2(graph: Graph, tree: Tree, f: int) -> tuple[float, float, float, float, float]:
+    """√ω times (9.33) of factor f between plane poses, less what a chord step has corrected its model by; since both
+    were linearized, |sⱼ − sᵢ|², the square of the second pose's shift as seen from the first, φ, and by how much the
+    second has turned as seen from the first.
     """
     var, fac, values, row = graph.var, graph.fac, graph.values, tree.factor_errors[f]
     i, j = fac[f, at.F_I], fac[f, at.F_J]
     phi = turn_since_linearized(i, var, tree.scalars[0])
-    bx, by, shift = missed_se2(var[i, at.V_AT], var[j, at.V_AT], phi, values, tree.lin[0])
+    bx, by, moved, shift = missed_se2(var[i, at.V_AT], var[j, at.V_AT], phi, values, tree.lin[0])
     if row[tl.E_FORM] >= tl.CORRECTED:
         bx, by = bx - row[tl.E_MISSED], by - row[tl.E_MISSED + 1]
-    return (
-        row[tl.E_ROOT] * math.sqrt(bx * bx + by * by),
-        shift,
-        abs(turn_since_linearized(j, var, tree.scalars[0]) - phi),
-    )
+    psi = abs(turn_since_linearized(j, var, tree.scalars[0]) - phi)
+    return row[tl.E_ROOT] * math.sqrt(bx * bx + by * by), moved, shift, phi, psi
 
 
 @inline_kernel
@@ -49,17 +47,17 @@ def turn_since_linearized(i: int, var: I64, delta: F64) -> float:
 
 
 @inline_kernel
-def missed_se2(x: int, y: int, phi: float, values: F64, lin: F64) -> tuple[float, float, float]:
+def missed_se2(x: int, y: int, phi: float, values: F64, lin: F64) -> tuple[float, float, float, float]:
     """R₀ times (9.33), of the plane poses at offsets x and y, so in the map's frame; of the angle nothing is missed.
-    And by how much y has shifted as seen from x.
+    And the squares of what y has shifted by as x has not, and as seen from x.
     """
     tx, ty = load(values, y) - load(values, x), load(values, y + 1) - load(values, x + 1)
     sx, sy = tx - (load(lin, y) - load(lin, x)), ty - (load(lin, y + 1) - load(lin, x + 1))
     versed, late = versed_and_late(phi)
     bx, by = -versed * tx - late * ty + phi * sy, -versed * ty + late * tx - phi * sx
-    sine = phi - late
+    sine, moved = phi - late, sx * sx + sy * sy
     sx, sy = sx - versed * tx + sine * ty, sy - versed * ty - sine * tx
-    return bx, by, math.sqrt(sx * sx + sy * sy)
+    return bx, by, moved, sx * sx + sy * sy
 
 
 @part
@@ -86,8 +84,8 @@ def versed_and_late(phi: float) -> tuple[float, float]:
     if not abs(phi) < SMALL_TURN:
         return 1.0 - math.cos(phi), phi - math.sin(phi)
     q = phi * phi
-    versed = q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q / 40320.0)))
-    return versed, phi * q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0 - q / 362880.0)))
+    versed = q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q * (1.0 / 40320.0))))
+    return versed, phi * q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0 - q * (1.0 / 362880.0))))
 
 
 @part
