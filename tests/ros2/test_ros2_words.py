@@ -19,8 +19,9 @@ from factorbus.ros2 import display, messages
 from factorbus.ros2.geometry import from_plane, from_quaternion
 from factorbus.ros2.messages import DETECTIONS, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
 from factorbus.ros2.names import NodeName, Topic, attachment, gid
+from factorbus.ros2.options import BridgeOptions, RobotOptions
 from factorbus.ros2.problems import BadRosMessage, BadRosName
-from factorbus.ros2.settings import BridgeOptions, Settings, from_options
+from factorbus.ros2.settings import Settings, bridge_settings
 
 MESSAGES = Messages("jazzy")
 TYPES = {
@@ -172,12 +173,11 @@ def test_mounts_that_cannot_be_are_wrong_use(mount: str, capsys: pytest.CaptureF
 
 
 def test_options_arrive() -> None:
-    options = BridgeOptions(
-        odom="/o", poses=(), landmarks=("/a", "/b"), tf="/tf", path="/p", markers="/m", map_frame="map", space=True,
-        letter="a", start="pose", keyframe=(1.0, 2.0), mounts=("c=1,2,3,0,0,0,1",), drift=(0.1, 0.2), tolerance=0.5,
-        display=2.0,
+    robot = RobotOptions(
+        odom="/o", poses=(), landmarks=("/a", "/b"), map_frame="map", space=True, letter="a", start="pose",
+        keyframe=(1.0, 2.0), mounts=("c=1,2,3,0,0,0,1",), drift=(0.1, 0.2),
     )  # fmt: skip
-    made = from_options(options)
+    made = bridge_settings(robot, BridgeOptions(tf="/tf", path="/p", markers="/m", tolerance=0.5, display=2.0))
     assert (made.poses, made.landmarks, made.space, made.floors.turn_rad) == (
         ("/initialpose",),
         ("/a", "/b"),

@@ -279,7 +279,7 @@ def describe(draft: Draft) -> str:
 def _identity(topic: str, seen: Any) -> str:
     """The detection's own id, else the class of its best hypothesis (a tag's number, usually)."""
     best = _best(seen)
-    identity = seen.id or (best.hypothesis.class_id if best is not None else "")
+    identity = getattr(seen, "id", "") or (_class_of(best) if best is not None else "")
     if not identity:
         raise BadRosMessage(topic, "a detection without id or class", "one that says which landmark it is")
     return identity
@@ -292,7 +292,12 @@ def _translation_only(numbers: F64) -> F64:
 
 
 def _best(seen: Any) -> Any:
-    return max(seen.results, key=lambda each: each.hypothesis.score, default=None)
+    return max(seen.results, key=lambda each: getattr(each, "hypothesis", each).score, default=None)
+
+
+def _class_of(result: Any) -> str:
+    """Of a hypothesis, which in ROS 1 has a number."""
+    return str(result.hypothesis.class_id if hasattr(result, "hypothesis") else result.id)
 
 
 def _cross(p: F64) -> F64:

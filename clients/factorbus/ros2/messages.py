@@ -60,14 +60,19 @@ class Stamp:
         return cls(message.sec * 1_000_000_000 + message.nanosec)
 
 
+def register_detections(store: Any) -> None:
+    """Add what landmarks come as to a type store."""
+    for name, text in _VISION.items():
+        store.register(get_types_from_msg(text, name))
+
+
 class Messages:
     """The types of one distribution.  Everything in `type_of` is a dataclass whose fields are those of the message."""
 
     def __init__(self, distribution: str) -> None:
         self._store = get_typestore(DISTRIBUTIONS[distribution])
         self._hashed = distribution != "humble"
-        for name, text in _VISION.items():
-            self._store.register(get_types_from_msg(text, name))
+        register_detections(self._store)
 
     def hash(self, type_name: str) -> str:
         """RIHS01_ and the SHA-256 of the type's description (REP 2016), or what stands for it."""

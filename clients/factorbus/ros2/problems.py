@@ -1,5 +1,7 @@
 """What can be wrong with what a robot says, or with how it is named."""
 
+from pathlib import Path
+
 from factorbus.proto.problems import Problem
 
 
@@ -25,6 +27,15 @@ class Unusable(Problem):
             "are. Report this, with the log",
             topic=topic,
         )
+
+
+class BadRecording(Problem):
+    """A recording that cannot be read, or has nothing to drive by."""
+
+    code = "bad_file"
+
+    def __init__(self, path: Path, found: str, wanted: str) -> None:
+        super().__init__(f"{path}: {found}; wanted {wanted}", file=str(path), line=None, seen=found, wanted=wanted)
 
 
 class BadRosName(Problem):

@@ -1,11 +1,14 @@
 """The settings of a bridge: topics, frames, when there is a keyframe, how certain anything may be."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.geometry import Transform, from_quaternion
+from factorbus.ros2.options import BridgeOptions, RobotOptions
 from factorbus.ros2.problems import BadRosName
+
+USUAL_POSES, USUAL_LANDMARKS = ("/initialpose",), ("/detections",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +39,8 @@ class Settings:
     """
 
     odometry: str = "/odom"
-    poses: tuple[str, ...] = ("/initialpose",)
-    landmarks: tuple[str, ...] = ("/detections",)
+    poses: tuple[str, ...] = USUAL_POSES
+    landmarks: tuple[str, ...] = USUAL_LANDMARKS
     path: str = "/factorbus/path"
     markers: str = "/factorbus/markers"
     transforms: str = "/tf"
@@ -54,53 +57,38 @@ class Settings:
     floors: Floors = field(default_factory=Floors)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BridgeOptions:
-    """The options of `factorbus ros2` that are about the map, under the command line's names.
-
-    odom, poses, landmarks, tf, path, markers: topics.  space: poses in space.  keyframe: metres, radians.
-    mounts: FRAME=x,y,z,qx,qy,qz,qw.  drift: per metre, per radian.  tolerance, display: seconds.
-    """
-
-    odom: str
-    poses: Sequence[str]
-    landmarks: Sequence[str]
-    tf: str
-    path: str
-    markers: str
-    map_frame: str
-    space: bool
-    letter: str
-    start: str
-    keyframe: tuple[float, float]
-    mounts: Sequence[str]
-    drift: tuple[float, float]
-    tolerance: float
-    display: float
+def bridge_settings(robot: RobotOptions, bridge: BridgeOptions) -> Settings:
+    """Of a bridge.  Raises BadRosName, BadSymbol."""
+    given = robot_settings(robot)
+    # Without these options the usual topics are read.
+    return replace(
+        given,
+        poses=given.poses or USUAL_POSES,
+        landmarks=given.landmarks or USUAL_LANDMARKS,
+        path=bridge.path,
+        markers=bridge.markers,
+        transforms=bridge.tf,
+        tolerance_s=bridge.tolerance,
+        display_s=bridge.display,
+    )
 
 
-def from_options(options: BridgeOptions) -> Settings:
-    """From the options of the command.  Raises BadRosName, BadSymbol."""
+def robot_settings(options: RobotOptions) -> Settings:
+    """Of a robot, with the topics that were given and no others.  Raises BadRosName, BadSymbol."""
     symbol(options.letter, 0)
-    given = Settings(
+    return Settings(
         odometry=options.odom,
-        path=options.path,
-        markers=options.markers,
-        transforms=options.tf,
+        poses=tuple(options.poses),
+        landmarks=tuple(options.landmarks),
         map_frame=options.map_frame,
         space="space" if options.space else "plane",
         letter=options.letter,
         start=options.start,
         keyframe_m=options.keyframe[0],
         keyframe_rad=options.keyframe[1],
-        tolerance_s=options.tolerance,
-        display_s=options.display,
         mounts=dict(map(_mount, options.mounts)),
         floors=Floors(drift_m=options.drift[0], drift_rad=options.drift[0] / 2, turn_rad=options.drift[1]),
     )
-    # Without these options the usual topics are read.
-    given = replace(given, poses=tuple(options.poses)) if options.poses else given
-    return replace(given, landmarks=tuple(options.landmarks)) if options.landmarks else given
 
 
 def _mount(text: str) -> tuple[str, Transform]:

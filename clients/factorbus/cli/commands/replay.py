@@ -1,7 +1,7 @@
 """`factorbus replay`: a graph file or a data set through a map, pose by pose, as a robot would have sent it."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,22 +9,26 @@ from typing import Any
 
 import click
 
+from factorbus.cli.driving.replay_reading import check_kind, read_steps
+from factorbus.cli.driving.replay_source import source_of
 from factorbus.cli.output.exits import REFUSED, Stopped, missing_modules, output_file, require
-from factorbus.cli.output.starts import optimum_from, ratio_to
+from factorbus.cli.output.replay_table import replay_rows
+from factorbus.cli.output.starts import optimum_from
 from factorbus.cli.process.options import (
     SECONDS,
     Number,
     file_argument,
+    grouped,
     json_option,
     mode_option,
     out_option,
     zenoh_option,
 )
-from factorbus.cli.process.reading import COUNTED, read_graph, reading_options
-from factorbus.wording import counted
+from factorbus.cli.process.reading import reading_options, say
+from factorbus.cli.process.robot_options import robot_options
+from factorbus.ros2.options import RobotOptions
 
 _ANSWER_S, _LISTENING_S = 10.0, 1.0
-_SHOWN = 5  # of what is fixed
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +57,8 @@ class ReplayRequest:
     pace: float | None = None
     dialect: str | None = None
     strict: bool = False
+    robot: RobotOptions | None = None
+    rate: float | None = None
 
     @property
     def where(self) -> str:
@@ -63,6 +69,7 @@ class ReplayRequest:
 
 
 @click.command()
+@grouped("robot", RobotOptions)
 @file_argument("file")
 @click.option("--in-process", is_flag=True, help="Run the solver in this process, without a bus.")
 @click.option("--connect", metavar="ENDPOINT", help="Use the service at ENDPOINT instead of starting one.")
@@ -100,11 +107,15 @@ class ReplayRequest:
     "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Of the page with --live; 0: any."
 )
 @click.option("--pace", type=Number(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
+@click.option(
+    "--rate", type=Number(0, min_open=True), metavar="X", help="A recording in its own time, X times as fast."
+)
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
 @out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
 @out_option("--out", "out", "Write the estimate and the factors, in the form of the ending.", "FILE.g2o|.pyfg|.jrl")
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @reading_options
+@robot_options(usual=False)
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
     """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, or a data set's name) through a map, pose by pose.
@@ -113,8 +124,13 @@ def command(as_json: bool, **asked: Any) -> None:
     there after every step. What FILE fixes holds the map in place, or its priors; without either the pose of the lowest
     key is held. Without --in-process or --connect it starts a solver process and talks to it over the bus.
 
+    FILE may be a robot's recording, too: an MCAP file or a rosbag2 folder of ROS 2, or a bag of ROS 1. It is driven as
+    `factorbus ros2` would have sent it; the options from --odom on are of recordings.
+
     \b
     factorbus replay intel
+    factorbus replay drive.mcap --plot drive.png
+    factorbus replay drive.mcap --odom /wheel/odom --landmarks /tags --rate 1 --live
     factorbus replay intel.g2o --every 100 --plot intel.png
     factorbus replay intel.g2o --live --pace 100
     factorbus replay intel.g2o --connect tcp/127.0.0.1:7447 --map lab --tum lab.tum
@@ -134,6 +150,7 @@ def command(as_json: bool, **asked: Any) -> None:
       adopted      null, or what the map left for a better optimum at the end (better_optimum)
     """
     request = ReplayRequest(**asked)
+    check_kind(request.file)
     if request.in_process and request.connect:
         raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
     if request.in_process and request.live:
@@ -144,7 +161,7 @@ def command(as_json: bool, **asked: Any) -> None:
         if as_json:
             screen.document(result)
         else:
-            screen.table(_rows(result), title=f"{request.file}, in {request.where}")
+            screen.table(replay_rows(result), title=f"{request.file}, in {request.where}")
 
     replay(request, report)
 
@@ -153,7 +170,6 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
     """Do it, with progress on standard error; returns the document, and hands it to `report` while the map is there."""
     from factorbus.cli.driving.aligned_truth import aligned_error_m
     from factorbus.cli.driving.drive import insert_steps
-    from factorbus.cli.driving.replay_source import source_of
     from factorbus.cli.output import console as screen
 
     if request.plot:
@@ -161,12 +177,11 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
     if request.live:
         require("gateway", "--live")
     request = replace(request, file=source_of(request.file))
-    graph = read_graph(request.file, request.dialect, request.strict)
-    steps = graph.steps(use_values=request.use_values)
+    graph, steps = read_steps(request)
     with _target(request) as target:
         before = target.summary()
         with screen.progress(request.file.name, steps.poses) as show:
-            driven = insert_steps(target, _paced(steps, request.pace), request.every, show)
+            driven = insert_steps(target, _paced(steps, request.pace, request.rate), request.every, show)
         unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
         adopted = None
@@ -276,12 +291,15 @@ def _target(request: ReplayRequest) -> Iterator[Any]:
         yield target
 
 
-def _paced(steps: Iterable[Any], pace_hz: float | None) -> Iterator[Any]:
-    """The same steps, at most `pace_hz` a second."""
+def _paced(steps: Any, pace_hz: float | None, rate: float | None) -> Iterator[Any]:
+    """The same steps, at most `pace_hz` a second, or in the time of the recording, `rate` times as fast."""
     begun = time.monotonic()
     for number, step in enumerate(steps):
-        if pace_hz is not None:
-            time.sleep(max(0.0, begun + number / pace_hz - time.monotonic()))  # the pace that was asked for
+        due = number / pace_hz if pace_hz is not None else 0.0
+        if rate is not None:
+            due = max(due, 1e-9 * (steps.times_ns[number] - steps.times_ns[0]) / rate)
+        if due:
+            time.sleep(max(0.0, begun + due - time.monotonic()))  # the pace that was asked for
         yield step
 
 
@@ -298,7 +316,6 @@ def _stay() -> None:
 def _write(request: ReplayRequest, target: Any, source: Any) -> list[Path]:
     """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
     from factorbus.cli.output.console import print_note
-    from factorbus.cli.process.reading import say
     from factorbus.formats import write_graph, write_kitti, write_tum
     from factorbus.proto.messages import Batch
 
@@ -349,50 +366,3 @@ def _chi2_initial(steps: Any) -> float | None:
     from factorbus.cli.driving.local import chi2_unsolved
 
     return chi2_unsolved(steps)
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
-
-
-def _size(result: dict[str, Any]) -> str:
-    return ", ".join(counted(result[many], one) for many, one in COUNTED)
-
-
-def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
-    step, bus = result["step_ms"], result["bus_ms"]
-    rows = [
-        ("graph", _size(result)),
-        ("time", f"{result['seconds']:.2f} s, {result['poses_per_s']:.0f} poses/s"),
-        ("solver CPU", f"{result['solver_cpu_s']:.2f} s"),
-        ("step", _times(step)),
-        ("fixed", _listed(result["fixed"]) or "nothing: the file's priors hold it"),
-    ]
-    if bus:
-        rows.append(("bus", _times(bus)))
-        rows.append(("estimates received", f"{result['deltas']}, at revision {result['revision']}"))
-    initial = "" if result["chi2_initial"] is None else f", {result['chi2_initial']:.6g} by odometry"
-    rows.append(("χ²", f"{result['chi2']:.8g}, {result['chi2_unsettled']:.8g} after the last step{initial}"))
-    if error := result.get("error_m"):
-        away = f"rms {error['rms']:.3g} m, max {error['max']:.3g} m of {counted(error['poses'], 'pose')}"
-        rows.append(("from ground truth", f"{away}, aligned"))
-    for each in result["against_batch"]:
-        by = f"{_optimum(each, result)}; {each['worker']}, {each['seconds']:.2f} s"
-        worse = "  better_optimum" if each["better_optimum"] else ""
-        rows.append((f"χ² / batch at {each['revision']}", f"{ratio_to(each['chi2'], each['batch'])}  ({by}){worse}"))
-    if result["adopted"]:
-        was = f"{result['adopted']['chi2']:.8g}, {_optimum(result['adopted'], result)}"
-        rows.append(("better_optimum", f"adopted: χ² was {was}"))
-    rows.append(("strategies", ", ".join(f"{name} {count}" for name, count in result["strategies"].items())))
-    if result["kernels_compiled_s"] > 0.1:
-        rows.append(("compiling", f"{result['kernels_compiled_s']:.1f} s, once on this machine"))
-    return rows
-
-
-def _optimum(compared: dict[str, Any], result: dict[str, Any]) -> str:
-    return optimum_from(compared["start"], result["use_values"], compared["batch_converged"])
-
-
-def _times(times: dict[str, float]) -> str:
-    return f"p50 {times['p50']:.2f}   p95 {times['p95']:.2f}   p99 {times['p99']:.2f}   max {times['max']:.2f} ms"

@@ -4,14 +4,15 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import click
 
 from factorbus.cli.output.exits import require
 from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.options import DEFAULT_ENDPOINT, Number, grouped, zenoh_option
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, grouped, zenoh_option
+from factorbus.cli.process.robot_options import robot_options
+from factorbus.ros2.options import BridgeOptions, RobotOptions
 
 DISTRIBUTIONS = ("humble", "jazzy", "kilted", "lyrical")
 # The interpreter's default, 5 ms, is what a transform would wait for while a path is being drawn.
@@ -31,6 +32,8 @@ class NodeOptions:
 
 @click.command()
 @grouped("as_node", NodeOptions)
+@grouped("robot", RobotOptions)
+@grouped("bridging", BridgeOptions)
 @click.argument("map_name", metavar="MAP")
 @click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="Ours.")
 @click.option("--ros", metavar="ENDPOINT", help="The robot's Zenoh router (rmw_zenohd).  [default: as --connect]")
@@ -40,42 +43,12 @@ class NodeOptions:
 @click.option("--distro", type=click.Choice(DISTRIBUTIONS), default="jazzy", show_default=True, help="Of the robot.")
 @click.option("--namespace", default="/", show_default=True, metavar="NAME", help="Of our node; topics are as given.")
 @click.option("--node", "node_name", default="factorbus", show_default=True, metavar="NAME", help="Of our node.")
-@click.option("--odom", default="/odom", show_default=True, metavar="TOPIC", help="nav_msgs/Odometry, to read.")
-@click.option(
-    "--pose", "poses", multiple=True, metavar="TOPIC",
-    help="geometry_msgs/PoseWithCovarianceStamped, to read.  [default: /initialpose]",
-)  # fmt: skip
-@click.option(
-    "--landmarks", multiple=True, metavar="TOPIC",
-    help="vision_msgs/Detection3DArray, to read.  [default: /detections]",
-)  # fmt: skip
+@robot_options(usual=True)
 @click.option("--tf", default="/tf", show_default=True, metavar="TOPIC", help="Where map to odometry goes.")
 @click.option("--path", default="/factorbus/path", show_default=True, metavar="TOPIC", help="Where nav_msgs/Path goes.")
 @click.option(
     "--markers", default="/factorbus/markers", show_default=True, metavar="TOPIC",
     help="Where visualization_msgs/MarkerArray goes.",
-)  # fmt: skip
-@click.option("--map-frame", default="map", show_default=True, metavar="FRAME")
-@click.option("--space", is_flag=True, help="Poses in space (se3, point3), not in the plane (se2, point2).")
-@click.option("--letter", default="x", show_default=True, metavar="LETTER", help="Of this robot's keys: one for each.")
-@click.option(
-    "--start", type=click.Choice(("odometry", "pose")), default="odometry", show_default=True,
-    help="Where the map begins: where odometry does, or with the first pose that is received.",
-)  # fmt: skip
-@click.option(
-    "--keyframe", nargs=2, type=Number(min=0, min_open=True), default=(0.5, 0.35), show_default=True,
-    metavar="METRES RADIANS", help="Least way or turn between two poses of the map.",
-)  # fmt: skip
-@click.option(
-    "--mount",
-    "mounts",
-    multiple=True,
-    metavar="FRAME=x,y,z,qx,qy,qz,qw",
-    help="Where a sensor's frame is on the robot.",
-)
-@click.option(
-    "--drift", nargs=2, type=Number(min=0, min_open=True), default=(0.02, 0.02), show_default=True,
-    metavar="PER_METRE PER_RADIAN", help="Odometry is not believed to be better than this.",
 )  # fmt: skip
 @click.option("--tolerance", default=0.1, show_default=True, metavar="SECONDS", help="Transforms are stamped ahead.")
 @click.option("--display", default=1.0, show_default=True, metavar="SECONDS", help="Least time between paths.")
@@ -87,11 +60,12 @@ def command(
     map_name: str,
     endpoint: str,
     as_node: NodeOptions,
+    robot: RobotOptions,
+    bridging: BridgeOptions,
     log_form: str,
     quiet: bool,
     until_eof: bool,
     zenoh: str,
-    **given: Any,
 ) -> None:
     """Join a robot that speaks ROS 2 over Zenoh (rmw_zenoh) to MAP. No ROS is needed on this side.
 
@@ -111,10 +85,10 @@ def command(
     from factorbus.ros2.bridge import Bridge
     from factorbus.ros2.messages import Messages
     from factorbus.ros2.node import open_node
-    from factorbus.ros2.settings import BridgeOptions, from_options
+    from factorbus.ros2.settings import bridge_settings
 
     begin_logging(log_form, quiet)
-    settings, ros = from_options(BridgeOptions(**given)), as_node.ros
+    settings, ros = bridge_settings(robot, bridging), as_node.ros
     with (
         _switching_often(),
         stop_on_signals(until_eof) as stop,

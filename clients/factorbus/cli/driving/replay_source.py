@@ -1,10 +1,18 @@
-"""What `factorbus replay` drives: a graph file, or a data set by its name where there is no such file."""
+"""What `factorbus replay` drives: a graph file, a robot's recording, or a data set by its name where there is no such
+file."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from factorbus.cli.output.exits import BAD_FILE, Stopped
 from factorbus.datasets import CATALOGUE, Dataset, DatasetProblem, Places, find
+
+_RECORDINGS = (".mcap", ".db3", ".bag")
+
+
+def is_recording(path: Path) -> bool:
+    """Whether it is one by its name: a rosbag2 folder, or a file that ends as recordings do."""
+    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in _RECORDINGS
 
 
 def source_of(given: Path, places: Places | None = None, catalogue: Sequence[Dataset] = CATALOGUE) -> Path:
@@ -20,7 +28,8 @@ def source_of(given: Path, places: Places | None = None, catalogue: Sequence[Dat
         raise Stopped(
             "bad_file",
             f"{given}: no such file, and no data set of that name; wanted a g2o, TORO, iSAM, SLAM++, "
-            f"PyFactorGraph or JRL file, or one of {', '.join(dataset.name for dataset in catalogue)}",
+            f"PyFactorGraph or JRL file, a recording (.mcap, .bag, rosbag2), "
+            f"or one of {', '.join(dataset.name for dataset in catalogue)}",
             BAD_FILE,
             path=str(given),
         )

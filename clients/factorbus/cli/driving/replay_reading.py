@@ -1,0 +1,40 @@
+"""What `factorbus replay` reads: a graph file or a robot's recording, and the options that are of one of them."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+from factorbus.cli.driving.replay_source import is_recording
+from factorbus.cli.output.exits import require
+from factorbus.cli.process.reading import read_graph, say
+from factorbus.ros2.options import RobotOptions
+
+
+def check_kind(file: Path) -> None:
+    """Raises UsageError: an option is of recordings, or of graph files, and FILE is the other."""
+    given = click.get_current_context().get_parameter_source
+    of_graphs, of_recordings = ("use_values", "dialect"), ("rate", *(each.name for each in fields(RobotOptions)))
+    recorded = is_recording(file)
+    for name in of_graphs if recorded else of_recordings:
+        if given(name) is ParameterSource.COMMANDLINE:
+            option = "--" + {"poses": "pose", "mounts": "mount"}.get(name, name).replace("_", "-")
+            is_of = "graph files, and this is a recording" if recorded else "recordings (.mcap, .bag, rosbag2)"
+            raise click.UsageError(f"{option} is of {is_of}")
+
+
+def read_steps(request: Any) -> tuple[Any, Any]:
+    """The graph or the recording that a `ReplayRequest` names, and its steps.  Raises FormatError, BadRecording."""
+    if not is_recording(request.file):
+        graph = read_graph(request.file, request.dialect, request.strict)
+        return graph, graph.steps(use_values=request.use_values)
+    require("ros2", "a recording")
+    from factorbus.ros2.recorded_drive import read_drive
+    from factorbus.ros2.settings import Settings, robot_settings
+
+    settings = robot_settings(request.robot) if request.robot else Settings(odometry="", poses=(), landmarks=())
+    drive = read_drive(request.file, settings, request.strict)
+    say(request.file, drive.notes)
+    return drive, drive.steps

@@ -1,0 +1,38 @@
+"""The options of commands that are about a robot, as they were given."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotOptions:
+    """The options of `factorbus ros2` and `factorbus replay` that are about a robot, under the command line's names.
+
+    odom, poses, landmarks: topics.  space: poses in space.  keyframe: metres, radians.
+    mounts: FRAME=x,y,z,qx,qy,qz,qw.  drift: per metre, per radian.
+    """
+
+    odom: str
+    poses: Sequence[str]
+    landmarks: Sequence[str]
+    map_frame: str
+    space: bool
+    letter: str
+    start: str
+    keyframe: tuple[float, float]
+    mounts: Sequence[str]
+    drift: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BridgeOptions:
+    """The options of `factorbus ros2` that are about what it publishes.
+
+    tf, path, markers: topics.  tolerance, display: seconds.
+    """
+
+    tf: str
+    path: str
+    markers: str
+    tolerance: float
+    display: float

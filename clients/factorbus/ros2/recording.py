@@ -1,0 +1,152 @@
+"""Recordings of robots: rosbag2 folders and files (SQLite, MCAP) and ROS 1 bags, by rosbags.  No ROS is needed.
+
+Of a recording that was cut off or is damaged what can be read is read, and where that ends is noted.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from factorbus.ros2.messages import DISTRIBUTIONS, register_detections
+from factorbus.ros2.problems import BadRecording
+from factorbus.wording import counted
+
+_LATEST = DISTRIBUTIONS["jazzy"]  # of recordings that do not say what their messages are made of
+
+
+class Recorded(NamedTuple):
+    """One message, as it was recorded.  read: gives it as an object, whose fields are those of the message."""
+
+    topic: str
+    type_name: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """What a recording has of a topic; count 0: it does not say how many."""
+
+    name: str
+    type_name: str
+    count: int
+
+
+class _Source(Protocol):
+    topics: list[Topic]
+
+    def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
+        """Of these topics, in the order in which they were recorded."""
+        ...
+
+    def read(self, message: Recorded) -> Any:
+        """As an object."""
+        ...
+
+
+class Recording:
+    """A recording that is open, until `close`.  `notes` tells what of it could not be read.
+
+    Raises BadRecording: it is none, or nothing of it can be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.notes = path, list[str]()
+        self._stack = ExitStack()
+        self._source: _Source = self._open()
+
+    @property
+    def topics(self) -> list[Topic]:
+        """All topics, by name."""
+        return sorted(self._source.topics, key=lambda topic: topic.name)
+
+    def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
+        """Of these topics, in the order in which they were recorded, up to where it is damaged."""
+        count = 0
+        try:
+            for message in self._source.messages(topics):
+                count += 1
+                yield message
+        except Exception as fault:  # whatever the file and the libraries that read it make of the damage
+            note = f"cut off or damaged after {counted(count, 'message')} ({_told(fault)}): what comes before is used"
+            if note not in self.notes:
+                self.notes.append(note)
+
+    def read(self, message: Recorded) -> Any:
+        """As an object.  Raises whatever the bytes lead to."""
+        return self._source.read(message)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._stack.close()
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open(self) -> _Source:
+        if not self.path.exists():
+            raise BadRecording(self.path, "no such file", "a rosbag2 folder, or a .mcap, .db3 or .bag file")
+        try:
+            return _Whole(self.path, self._stack)
+        except Exception as fault:  # whatever the file and the libraries that read it make of the damage
+            first = fault
+        if self.path.suffix == ".mcap":
+            return self._begun(first)
+        advice = "reindexed by `rosbag reindex`" if self.path.suffix == ".bag" else "with its end"
+        raise BadRecording(self.path, f"it cannot be read ({_told(first)})", f"a whole recording, {advice}")
+
+    def _begun(self, first: Exception) -> _Source:
+        """An MCAP file without its end, from its beginning."""
+        from factorbus.ros2.unfinished_mcap import UnfinishedMcap
+
+        try:
+            source = UnfinishedMcap(self.path)
+        except Exception as fault:
+            raise BadRecording(self.path, f"it cannot be read ({_told(fault)})", "an MCAP file") from None
+        if not source.topics:
+            raise BadRecording(self.path, f"no topic of ROS in it ({_told(first)})", "a robot's recording")
+        self.notes.append(f"it has no end ({_told(first)}): it is read from its beginning")
+        return source
+
+
+class _Whole:
+    """What rosbags can open."""
+
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        store = get_typestore(_LATEST)
+        register_detections(store)
+        self._reader = stack.enter_context(AnyReader([path], default_typestore=store))
+        self.topics = [
+            Topic(name, info.msgtype or "", info.msgcount) for name, info in self._reader.topics.items() if info.msgtype
+        ]
+
+    def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
+        """As in `Recording`."""
+        chosen = [each for each in self._reader.connections if each.topic in topics]
+        if chosen:
+            for connection, _, data in self._reader.messages(chosen):
+                yield Recorded(connection.topic, connection.msgtype, data)
+
+    def read(self, message: Recorded) -> Any:
+        """As in `Recording`."""
+        return self._reader.deserialize(message.data, message.type_name)
+
+
+def store_of(definitions: Sequence[tuple[str, str]]) -> Any:
+    """Types by their definitions (name, text), as recordings have them."""
+    store, types = get_typestore(Stores.EMPTY), {}
+    for name, text in definitions:
+        types.update(get_types_from_msg(text, name))
+    store.register(types)
+    return store
+
+
+def _told(fault: Exception) -> str:
+    return f"{type(fault).__name__}: {fault}".splitlines()[0][:120]

@@ -1,0 +1,59 @@
+"""An MCAP file without its end, as a recorder that was killed leaves it: record by record, by the mcap library.
+
+rosbags wants the index at the end of the file.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
+
+from factorbus.ros2.recording import Recorded, Topic, store_of
+
+_DEFINED, _ENCODED = "ros2msg", "cdr"
+
+
+class UnfinishedMcap:
+    """The messages in it that are ROS 2's.  Raises what the library does where not even the beginning can be read."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        schemas, channels, counts = dict[int, Schema](), dict[int, Channel](), Counter[int]()
+        try:
+            for record in self._records():
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    counts[record.channel_id] += 1
+        except Exception:  # where it ends: what comes before is there
+            if not channels:
+                raise
+        self._types = {
+            number: (channel.topic, schemas[channel.schema_id].name)
+            for number, channel in channels.items()
+            if channel.message_encoding == _ENCODED and schemas[channel.schema_id].encoding == _DEFINED
+        }
+        self.topics = [Topic(*self._types[number], counts[number]) for number in self._types]
+        used = {channels[number].schema_id for number in self._types}
+        self._store = store_of([(schemas[each].name, schemas[each].data.decode()) for each in sorted(used)])
+
+    def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
+        """As in `Recording`."""
+        for record in self._records():
+            if isinstance(record, Message) and record.channel_id in self._types:
+                topic, type_name = self._types[record.channel_id]
+                if topic in topics:
+                    yield Recorded(topic, type_name, record.data)
+
+    def read(self, message: Recorded) -> Any:
+        """As in `Recording`."""
+        return self._store.deserialize_cdr(message.data, message.type_name)
+
+    def _records(self) -> Iterator[Any]:
+        with self._path.open("rb") as stream:
+            yield from StreamReader(stream).records
