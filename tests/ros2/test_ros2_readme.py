@@ -6,18 +6,33 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+import recordings
 import ros
 from processes import Process
 
+from factorbus.cli.commands import replay
 from factorbus.cli.commands.ros2 import command
+from factorbus.cli.main import main
 from factorbus.ros2.settings import Floors, Settings
 
 README = (Path(__file__).parents[2] / "deploy" / "ros2" / "README.md").read_text(encoding="utf-8")
 
 
+BLOCKS = [shlex.split(text)[1:] for text in re.findall(r"^```bash\n(.*?)^```$", README, re.M | re.S)]
+
+
+def test_a_recording_is_replayed_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recordings.write_mcap(tmp_path / "drive.mcap", recordings.drive().said)
+    monkeypatch.chdir(tmp_path)
+    assert main(BLOCKS[2]) == 0
+    assert len((tmp_path / "drive.tum").read_text().splitlines()) == 45
+    assert (tmp_path / "drive.png").stat().st_size > 10_000
+
+
 def test_its_commands_run(spawn: Callable[..., Process]) -> None:
     """The robot's router is another service here: any Zenoh hub is one."""
-    serve, join = (shlex.split(text)[1:] for text in re.findall(r"^```bash\n(.*?)^```$", README, re.M | re.S))
+    serve, join, _ = BLOCKS
     assert serve[-2:] == ["--listen", "tcp/127.0.0.1:7448"]
     assert join[2:] == ["--connect", "tcp/127.0.0.1:7448", "--ros", "tcp/127.0.0.1:7447"]
     ours, theirs = (spawn("-m", "factorbus.cli", *serve[:-1], "tcp/127.0.0.1:0", "--no-warm") for _ in range(2))
@@ -33,7 +48,8 @@ def test_its_commands_run(spawn: Callable[..., Process]) -> None:
 
 def test_its_options_and_numbers_are_those_of_the_command() -> None:
     named = set(re.findall(r"`(--[a-z-]+)", README))
-    assert named <= {option for parameter in command.params for option in parameter.opts} | {"--listen"}
+    options = {option for each in (command, replay.command) for parameter in each.params for option in parameter.opts}
+    assert named <= options | {"--listen"}
     defaults = Settings()
     assert {defaults.odometry, *defaults.poses, *defaults.landmarks, defaults.transforms} <= set(
         re.findall(r"`(/\w+)`", README)

@@ -12,4 +12,6 @@ markers go out.  A client like any other: no compiler.  Needs the extra `ros2`.
 | `track`, `front_end` | from odometry to keyframes, from messages to what is inserted; no bus and no clock |
 | `display` | an estimate as a path and as markers |
 | `bridge` | all of it together |
+| `recording`, `unfinished_mcap` | what a robot recorded, also where it was cut off |
+| `recorded_drive` | a recording as the inserts that the bridge would have sent |
 """

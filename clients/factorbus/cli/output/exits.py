@@ -33,7 +33,7 @@ EXTRAS = {
     "watch": ("rerun",),
     "record": ("foxglove",),
     "gateway": ("starlette", "uvicorn", "websockets"),
-    "ros2": ("rosbags", "xxhash"),
+    "ros2": ("rosbags", "xxhash", "mcap"),
 }
 
 _USAGE_CODES = (
