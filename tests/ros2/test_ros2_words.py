@@ -19,7 +19,7 @@ from factorbus.ros2 import display, messages
 from factorbus.ros2.geometry import from_plane, from_quaternion
 from factorbus.ros2.messages import DETECTIONS, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
 from factorbus.ros2.names import NodeName, Topic, attachment, gid
-from factorbus.ros2.options import BridgeOptions, RobotOptions
+from factorbus.ros2.options import BridgeOptions
 from factorbus.ros2.problems import BadRosMessage, BadRosName
 from factorbus.ros2.settings import Settings, bridge_settings
 
@@ -173,11 +173,12 @@ def test_mounts_that_cannot_be_are_wrong_use(mount: str, capsys: pytest.CaptureF
 
 
 def test_options_arrive() -> None:
-    robot = RobotOptions(
+    options = BridgeOptions(
         odom="/o", poses=(), landmarks=("/a", "/b"), map_frame="map", space=True, letter="a", start="pose",
-        keyframe=(1.0, 2.0), mounts=("c=1,2,3,0,0,0,1",), drift=(0.1, 0.2),
+        keyframe=(1.0, 2.0), mounts=("c=1,2,3,0,0,0,1",), drift=(0.1, 0.2), tf="/tf", path="/p",
+        markers="/m", tolerance=0.5, display=2.0,
     )  # fmt: skip
-    made = bridge_settings(robot, BridgeOptions(tf="/tf", path="/p", markers="/m", tolerance=0.5, display=2.0))
+    made = bridge_settings(options)
     assert (made.poses, made.landmarks, made.space, made.floors.turn_rad) == (
         ("/initialpose",),
         ("/a", "/b"),

@@ -25,8 +25,8 @@ class RobotOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BridgeOptions:
-    """The options of `factorbus ros2` that are about what it publishes.
+class BridgeOptions(RobotOptions):
+    """Those of `factorbus ros2`, and what it publishes.
 
     tf, path, markers: topics.  tolerance, display: seconds.
     """

@@ -13,7 +13,7 @@ from factorbus.ros2.front_end import FrontEnd
 from factorbus.ros2.geometry import Transform, from_quaternion
 from factorbus.ros2.messages import DETECTIONS, ODOMETRY, POSE, TRANSFORMS
 from factorbus.ros2.problems import BadRecording, BadRosMessage
-from factorbus.ros2.recording import Recording, Topic
+from factorbus.ros2.recording import RecordedTopic, RobotRecording
 from factorbus.ros2.settings import Settings
 from factorbus.wording import counted
 
@@ -62,7 +62,7 @@ def read_drive(path: Path, settings: Settings, strict: bool = False) -> Recorded
     strict: refuse what would be left out.
     Raises BadRecording: it cannot be read, has no odometry, or, where `strict`, something in it was not used.
     """
-    with Recording(path) as recording:
+    with RobotRecording(path) as recording:
         settings, notes = _with_topics(recording, settings)
         settings = replace(settings, mounts={**_mounts(recording, settings), **settings.mounts})
         made = _Reading(recording, settings)
@@ -78,7 +78,7 @@ def read_drive(path: Path, settings: Settings, strict: bool = False) -> Recorded
 class _Reading:
     """Message after message through a front end."""
 
-    def __init__(self, recording: Recording, settings: Settings) -> None:
+    def __init__(self, recording: RobotRecording, settings: Settings) -> None:
         self._recording, self._settings = recording, settings
         self._front_end = FrontEnd(settings, 0, (), settings.start == "pose")
         self.steps, self.used, self.left_out = RecordedSteps(), Counter[str](), Counter[str]()
@@ -132,7 +132,7 @@ class _Reading:
         self._why.setdefault(topic, f"{bad.detail['seen']}; wanted {bad.detail['wanted']}")
 
 
-def _with_topics(recording: Recording, settings: Settings) -> tuple[Settings, list[str]]:
+def _with_topics(recording: RobotRecording, settings: Settings) -> tuple[Settings, list[str]]:
     """The topics to read, those not named by their types, and what was chosen.  Raises BadRecording."""
     topics = {topic.name: topic for topic in recording.topics}
     named = [*([settings.odometry] if settings.odometry else []), *settings.poses, *settings.landmarks]
@@ -152,7 +152,7 @@ def _with_topics(recording: Recording, settings: Settings) -> tuple[Settings, li
     return settings, notes
 
 
-def _with_odometry(recording: Recording, settings: Settings) -> tuple[Settings, str]:
+def _with_odometry(recording: RobotRecording, settings: Settings) -> tuple[Settings, str]:
     """With the odometry of the recording: /odom, else one that ends so, else the one with most messages."""
     found = _of_type(recording, ODOMETRY)
     if not found:
@@ -163,16 +163,16 @@ def _with_odometry(recording: Recording, settings: Settings) -> tuple[Settings, 
     return replace(settings, odometry=best.name), f"odometry: {best.name}{others}"
 
 
-def _of_type(recording: Recording, type_name: str) -> list[Topic]:
+def _of_type(recording: RobotRecording, type_name: str) -> list[RecordedTopic]:
     return [topic for topic in recording.topics if topic.type_name == type_name]
 
 
-def _listed(topics: Sequence[Topic]) -> str:
+def _listed(topics: Sequence[RecordedTopic]) -> str:
     more = f" and {len(topics) - _SHOWN} more" if len(topics) > _SHOWN else ""
     return ", ".join(topic.name for topic in topics[:_SHOWN]) + more
 
 
-def _mounts(recording: Recording, settings: Settings) -> dict[str, Transform]:
+def _mounts(recording: RobotRecording, settings: Settings) -> dict[str, Transform]:
     """T_base_frame of all frames that /tf_static joins to the base frame of odometry."""
     edges: dict[str, dict[str, Transform]] = {}
     statics = [topic.name for topic in recording.topics if topic.name == _STATIC and topic.type_name == TRANSFORMS]
@@ -197,7 +197,7 @@ def _mounts(recording: Recording, settings: Settings) -> dict[str, Transform]:
     return found
 
 
-def _base_frame(recording: Recording, settings: Settings) -> str:
+def _base_frame(recording: RobotRecording, settings: Settings) -> str:
     """The frame that odometry is of, by its first message."""
     for message in recording.messages([settings.odometry]):
         try:

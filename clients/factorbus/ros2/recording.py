@@ -28,7 +28,7 @@ class Recorded(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class RecordedTopic:
     """What a recording has of a topic; count 0: it does not say how many."""
 
     name: str
@@ -37,7 +37,7 @@ class Topic:
 
 
 class _Source(Protocol):
-    topics: list[Topic]
+    topics: list[RecordedTopic]
 
     def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
         """Of these topics, in the order in which they were recorded."""
@@ -48,7 +48,7 @@ class _Source(Protocol):
         ...
 
 
-class Recording:
+class RobotRecording:
     """A recording that is open, until `close`.  `notes` tells what of it could not be read.
 
     Raises BadRecording: it is none, or nothing of it can be read.
@@ -60,7 +60,7 @@ class Recording:
         self._source: _Source = self._open()
 
     @property
-    def topics(self) -> list[Topic]:
+    def topics(self) -> list[RecordedTopic]:
         """All topics, by name."""
         return sorted(self._source.topics, key=lambda topic: topic.name)
 
@@ -84,7 +84,7 @@ class Recording:
         """Let go of the file."""
         self._stack.close()
 
-    def __enter__(self) -> "Recording":
+    def __enter__(self) -> "RobotRecording":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -124,18 +124,20 @@ class _Whole:
         register_detections(store)
         self._reader = stack.enter_context(AnyReader([path], default_typestore=store))
         self.topics = [
-            Topic(name, info.msgtype or "", info.msgcount) for name, info in self._reader.topics.items() if info.msgtype
+            RecordedTopic(name, info.msgtype or "", info.msgcount)
+            for name, info in self._reader.topics.items()
+            if info.msgtype
         ]
 
     def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
-        """As in `Recording`."""
+        """As in `RobotRecording`."""
         chosen = [each for each in self._reader.connections if each.topic in topics]
         if chosen:
             for connection, _, data in self._reader.messages(chosen):
                 yield Recorded(connection.topic, connection.msgtype, data)
 
     def read(self, message: Recorded) -> Any:
-        """As in `Recording`."""
+        """As in `RobotRecording`."""
         return self._reader.deserialize(message.data, message.type_name)
 
 

@@ -57,19 +57,19 @@ class Settings:
     floors: Floors = field(default_factory=Floors)
 
 
-def bridge_settings(robot: RobotOptions, bridge: BridgeOptions) -> Settings:
+def bridge_settings(options: BridgeOptions) -> Settings:
     """Of a bridge.  Raises BadRosName, BadSymbol."""
-    given = robot_settings(robot)
+    given = robot_settings(options)
     # Without these options the usual topics are read.
     return replace(
         given,
         poses=given.poses or USUAL_POSES,
         landmarks=given.landmarks or USUAL_LANDMARKS,
-        path=bridge.path,
-        markers=bridge.markers,
-        transforms=bridge.tf,
-        tolerance_s=bridge.tolerance,
-        display_s=bridge.display,
+        path=options.path,
+        markers=options.markers,
+        transforms=options.tf,
+        tolerance_s=options.tolerance,
+        display_s=options.display,
     )
 
 

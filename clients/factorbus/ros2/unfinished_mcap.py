@@ -11,7 +11,7 @@ from typing import Any
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from factorbus.ros2.recording import Recorded, Topic, store_of
+from factorbus.ros2.recording import Recorded, RecordedTopic, store_of
 
 _DEFINED, _ENCODED = "ros2msg", "cdr"
 
@@ -38,12 +38,12 @@ class UnfinishedMcap:
             for number, channel in channels.items()
             if channel.message_encoding == _ENCODED and schemas[channel.schema_id].encoding == _DEFINED
         }
-        self.topics = [Topic(*self._types[number], counts[number]) for number in self._types]
+        self.topics = [RecordedTopic(*self._types[number], counts[number]) for number in self._types]
         used = {channels[number].schema_id for number in self._types}
         self._store = store_of([(schemas[each].name, schemas[each].data.decode()) for each in sorted(used)])
 
     def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
-        """As in `Recording`."""
+        """As in `RobotRecording`."""
         for record in self._records():
             if isinstance(record, Message) and record.channel_id in self._types:
                 topic, type_name = self._types[record.channel_id]
@@ -51,7 +51,7 @@ class UnfinishedMcap:
                     yield Recorded(topic, type_name, record.data)
 
     def read(self, message: Recorded) -> Any:
-        """As in `Recording`."""
+        """As in `RobotRecording`."""
         return self._store.deserialize_cdr(message.data, message.type_name)
 
     def _records(self) -> Iterator[Any]:

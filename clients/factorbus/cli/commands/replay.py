@@ -11,8 +11,8 @@ import click
 
 from factorbus.cli.driving.replay_reading import check_kind, read_steps
 from factorbus.cli.driving.replay_source import source_of
+from factorbus.cli.driving.replay_table import replay_rows
 from factorbus.cli.output.exits import REFUSED, Stopped, missing_modules, output_file, require
-from factorbus.cli.output.replay_table import replay_rows
 from factorbus.cli.output.starts import optimum_from
 from factorbus.cli.process.options import (
     SECONDS,

@@ -12,7 +12,7 @@ from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
 from factorbus.cli.process.options import DEFAULT_ENDPOINT, grouped, zenoh_option
 from factorbus.cli.process.robot_options import robot_options
-from factorbus.ros2.options import BridgeOptions, RobotOptions
+from factorbus.ros2.options import BridgeOptions
 
 DISTRIBUTIONS = ("humble", "jazzy", "kilted", "lyrical")
 # The interpreter's default, 5 ms, is what a transform would wait for while a path is being drawn.
@@ -32,8 +32,7 @@ class NodeOptions:
 
 @click.command()
 @grouped("as_node", NodeOptions)
-@grouped("robot", RobotOptions)
-@grouped("bridging", BridgeOptions)
+@grouped("given", BridgeOptions)
 @click.argument("map_name", metavar="MAP")
 @click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="Ours.")
 @click.option("--ros", metavar="ENDPOINT", help="The robot's Zenoh router (rmw_zenohd).  [default: as --connect]")
@@ -60,8 +59,7 @@ def command(
     map_name: str,
     endpoint: str,
     as_node: NodeOptions,
-    robot: RobotOptions,
-    bridging: BridgeOptions,
+    given: BridgeOptions,
     log_form: str,
     quiet: bool,
     until_eof: bool,
@@ -88,7 +86,7 @@ def command(
     from factorbus.ros2.settings import bridge_settings
 
     begin_logging(log_form, quiet)
-    settings, ros = bridge_settings(robot, bridging), as_node.ros
+    settings, ros = bridge_settings(given), as_node.ros
     with (
         _switching_often(),
         stop_on_signals(until_eof) as stop,
