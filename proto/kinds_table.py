@@ -22,9 +22,9 @@ _OPERATIONS_HEAD = """\
 _FAMILIES = (
     f"| `{LINEAR_NAME}` | any x₁, x₂, … | y of each variable, H of each (rows x its scalars, row by row), b (rows) "
     "| Σ Hₙ (xₙ ⊟ yₙ) + b |\n"
-    f"| `{inertial.NAME}` | se3 a, vector3 vₐ, vector6 βₐ, se3 b, vector3 v_b, vector6 β_b | {inertial.MEASURED} "
-    f"| {inertial.DIFFERENCE} |\n"
 )
+_MOMENTS = "se3 a, vector3 vₐ, vector6 βₐ, se3 b, vector3 v_b, vector6 β_b"
+_FURTHER = {(True, False): ", se3 m", (False, True): ", vector3 g", (True, True): ", se3 m, vector3 g"}
 
 
 def main() -> None:
@@ -39,7 +39,19 @@ def table() -> str:
     rows = [
         f"| `{kind.name}` | {_ends(kind)} | {kind.measured} | {kind.residual} |\n" for kind in FACTOR_KINDS.values()
     ]
-    return _HEAD + "".join(rows) + _FAMILIES
+    return _HEAD + "".join(rows) + _FAMILIES + "".join(_inertial(samples) for samples in (1, 0))
+
+
+def _inertial(samples: int) -> str:
+    """The rows of inertial factors: of any number of samples, or of none."""
+    form = inertial.ImuForm(samples)
+    name = inertial.NAME if samples else form.name
+    rows = [f"| `{name}` | {_MOMENTS} | {form.measured} | {form.residual} |\n"]
+    for (mount, gravity), further in _FURTHER.items():
+        named = name + inertial.ImuForm(1, mount, gravity).name.removeprefix(inertial.ImuForm(1).name)
+        letters = " and ".join(["m"] * mount + ["g"] * gravity)
+        rows.append(f"| `{named}` | {_MOMENTS}{further} | that of {name} without {letters} | that of {name} |\n")
+    return "".join(rows)
 
 
 def operations() -> str:
@@ -66,10 +78,10 @@ def _ends(kind: FactorKind) -> str:
         further = zip(kind.connects[len(base.connects) :], kind.modifiers, strict=True)
         return ", ".join([_ends(base), *(f"{end} {LETTERS[modifier]}" for end, modifier in further)])
     poses = [VARIABLE_KINDS[end].is_pose for end in kind.connects]
-    if kind.roles:
-        letters = ["f", "v"]
-    elif len(poses) == 1:
+    if len(poses) == 1:
         letters = ["x"]
+    elif kind.roles:
+        letters = ["f", "v"]
     elif all(poses):
         letters = ["a", "b"]
     else:

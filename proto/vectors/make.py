@@ -21,7 +21,8 @@ import msgpack
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind, imu_kind, linear_kind
+from factorbus.proto.inertial import RESIDUAL, ImuForm
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind, inertial_kind, linear_kind
 from factorbus.proto.messages import (
     Batch,
     Change,
@@ -164,6 +165,7 @@ def _other_kinds() -> Batch:
             Factors("range_se3", np.array([[y, p]]), np.array([[3.5]]), unit1),
             Factors("range_between_se2", np.array([[x, x + 1]]), np.array([[2.5]]), unit1),
             Factors("range_between_se3", np.array([[y, y + 1]]), np.array([[3.5]]), unit1),
+            Factors("length_vector3", np.array([[symbol("g", 1)]]), np.array([[9.8125]]), unit1),
             Factors("bearing_se2", np.array([[x, l]]), np.array([[-0.25]]), unit1),
             Factors("bearing_se3", np.array([[y, p]]), np.array([[0.0, 3.0, 4.0]]), unit3),
             Factors("linear_3_se2", np.array([[x]]), np.array([[*here, *H2, *b2]]), unit3),
@@ -250,23 +252,24 @@ def _named(end: str, role: str, n: int, space: str) -> int:
 
 
 def _inertial() -> Batch:
-    """An IMU's samples between two moments; what is known of the first of them."""
+    """An IMU's samples between two moments, and what others are integrated to; what is known of the first of them."""
     before, after = ([symbol(letter, n) for letter in "xvb"] for n in (1, 2))
-    kind, kinds = imu_kind(2), ("se3", "vector3", "vector6")
+    kinds, (mount, gravity) = ("se3", "vector3", "vector6"), (symbol("m", 1), symbol("g", 1))
     first = [0.0] * 6 + [1.0], [1.5, 0.25, 0.0], [0.0] * 6
+    further = Variables("se3", np.array([mount]), np.array([[0.25, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]]))
+    factors = []
+    for form in (ImuForm(2), ImuForm(2, mount=True), ImuForm(0), ImuForm(0, mount=True, gravity=True)):
+        kind, unit = inertial_kind(form), np.eye(RESIDUAL)[np.triu_indices(RESIDUAL)][None]
+        keys = np.array([[*before, *after, *[mount] * form.mount, *[gravity] * form.gravity]])
+        factors.append(Factors(kind.name, keys, np.array([kind.example]), unit))
     return Batch(
         (
             *(Variables(of, np.array([key]), np.array([x])) for of, key, x in zip(kinds, before, first, strict=True)),
             *(Variables(of, np.array([key])) for of, key in zip(kinds, after, strict=True)),
+            further,
+            Variables("vector3", np.array([gravity]), np.array([[0.0, 0.25, -9.75]])),
         ),
-        (
-            Factors(
-                kind.name,
-                np.array([[*before, *after]]),
-                np.array([kind.example]),
-                np.eye(kind.dim)[np.triu_indices(kind.dim)][None],
-            ),
-        ),
+        tuple(factors),
     )
 
 

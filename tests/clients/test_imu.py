@@ -1,24 +1,29 @@
 """A front end's IMU: samples cut at the poses, what standing still tells, what a draft makes of it, and merging."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from naive.dense_factors import boxplus, residual
-from naive.random_imu import keys_of, random_ends, random_imu
+from naive.random_imu import GRAVITY_KEY, MOUNT_KEY, keys_of, random_ends, random_imu
+from naive.random_imu import NOISE as NOISE_NUMBERS
 from scipy.spatial.transform import Rotation
 
-from factorbus.client import Draft, ImuNoise, cut_samples, initial_from_standstill
+from factorbus.client import Draft, ImuNoise, cut_samples, initial_from_standstill, preintegrate_samples
+from factorbus.client.key_numbers import key_number
 from factorbus.client.merging import AbsoluteFactors, fit_into
+from factorbus.proto import codec
 from factorbus.proto import inertial as of
-from factorbus.proto.kinds import imu_kind
-from factorbus.proto.messages import Batch, Estimate, Factors, MapGraph, Variables
+from factorbus.proto.kinds import imu_kind, inertial_kind
+from factorbus.proto.messages import Batch, Estimate, Factors, Insert, MapGraph, Variables
 from factorbus.proto.problems import BadInformation, BadOption, BadShape, NotFiniteNumbers, Problem
-from factorbus.proto.roles import AXES, keys_of_role
+from factorbus.proto.roles import AXES, MOUNT, keys_of_role
 
 NOISE = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4)
 SAMPLES = np.array([[0.01, 0.1, 0, 0, 0.5, 0, 9.8], [0.02, 0.1, 0, 0, 0.5, 0, 9.8]])
+FORM = of.ImuForm(2)
 A, B = ("x0", "v0", "b0"), ("x1", "v1", "b1")
 
 
@@ -32,6 +37,7 @@ def test_samples_hold_until_the_next_and_are_cut_at_the_poses() -> None:
     np.testing.assert_allclose(whole, 0.05)
 
 
+MADE = preintegrate_samples(SAMPLES, NOISE)
 ONES, SHAKEN = np.ones((3, 3)), np.array([[0.0] * 7, [0, 1, 1, 1, 0, 0, 0]])
 REFUSED: dict[str, tuple[Callable[[], object], type[Problem], str]] = {
     "a sample before": (lambda: cut_samples([1, 2, 3], ONES, ONES, 0.5, 2), BadOption, "at begin_s"),
@@ -48,7 +54,18 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Problem], str]] = {
     "no samples": (lambda: Draft().imu(A, B, SAMPLES[:0], noise=NOISE), BadShape, "duration"),
     "too many": (lambda: Draft().imu(A, B, np.ones((2001, 7)), noise=NOISE), BadShape, "1 to 2000"),
     "no duration": (lambda: Draft().imu(A, B, 0 * SAMPLES, noise=NOISE), BadOption, "sample 0 lasts 0 s"),
-    "gravity": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, gravity=9.81), BadShape, "gravity"),
+    "gravity": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, gravity=(9.81,)), BadShape, "gravity"),
+    "mount": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, mount=(0, 0, 1)), BadShape, "mount"),
+    "no rotation": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, mount=[0] * 6 + [2]), BadShape, "mount.*length 2"),
+    "samples": (lambda: Draft().imu_preintegrated(A, B, SAMPLES), BadOption, "a Preintegrated"),  # type: ignore[arg-type]
+    "certain": (
+        lambda: Draft().imu_preintegrated(A, B, preintegrate_samples(SAMPLES[:1], NOISE)),
+        BadInformation,
+        "singular",
+    ),
+    "an instant": (lambda: replace(MADE, duration=0.0), BadOption, "more than 0 s"),
+    "a long quaternion": (lambda: replace(MADE, attitude=2 * MADE.attitude), BadShape, "length 2"),
+    "a small covariance": (lambda: replace(MADE, covariance=np.eye(9)), BadShape, r"covariance: .*\(15, 15\)"),
     "bias": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, bias=(0, 0, 0)), BadShape, "bias"),
     "moves": (lambda: initial_from_standstill(SAMPLES + SHAKEN), BadOption, "at rest"),
     "falls": (lambda: initial_from_standstill(SAMPLES * [1, 1, 1, 1, 1, 1, 0.1]), BadOption, "9.80665 ± 1"),
@@ -81,39 +98,109 @@ def test_standing_still_tells_attitude_and_gyroscope_bias(seed: int) -> None:
     np.testing.assert_allclose(still, -found.gravity, atol=1e-9)
 
 
+def test_what_standing_still_tells_is_as_certain_as_it_says() -> None:
+    """Of 300 standstills: the errors over their standard deviations have the mean square of so many numbers."""
+    rng, gyroscope, tilt = np.random.default_rng(4), list[float](), list[float]()
+    for _ in range(300):
+        R = Rotation.random(random_state=int(rng.integers(1 << 30)))
+        if abs(R.as_matrix()[2, 0]) > 0.98:  # its nose up or down: pitch and roll are no two angles
+            continue
+        bias, count = rng.normal(0, 0.01, 3), 200
+        w = bias + rng.normal(0, 0.01, (count, 3))
+        a = R.inv().apply([0, 0, 9.80665]) + rng.normal(0, 0.05, (count, 3))
+        found = initial_from_standstill(np.column_stack([np.full(count, 0.01), w, a]))
+        gyroscope.append(float((((found.bias[:3] - bias) / found.sigma_gyroscope) ** 2).sum()))
+        up = Rotation.from_quat(found.attitude).inv().apply([0, 0, 1.0])
+        tilt.append(float((np.cross(up, R.inv().apply([0, 0, 1.0])) ** 2).sum()) / found.sigma_tilt**2)
+    assert np.mean(gyroscope) == pytest.approx(3.0, abs=0.5)
+    assert 1.4 < np.mean(tilt) < 2.3, "sigma_tilt is of the noisiest axis"
+    assert np.mean(np.array(tilt) < 11.8) > 0.99
+
+
+def test_standing_still_with_a_mount_tells_how_the_robot_stands() -> None:
+    rng, mount = (
+        np.random.default_rng(2),
+        np.array([0.5, 0, 0.2, *Rotation.from_euler("XYZ", [0.7, -0.4, 1.1]).as_quat()]),
+    )
+    robot, turn = Rotation.from_euler("ZYX", [0.0, 0.3, -0.2]), Rotation.from_quat(mount[3:])
+    a = (robot * turn).inv().apply([0, 0, 9.80665]) + rng.normal(0, 0.02, (400, 3))
+    rows = np.column_stack([np.full(400, 0.01), rng.normal(0, 0.01, (400, 3)), a])
+    found = initial_from_standstill(rows, mount=mount)
+    assert (Rotation.from_quat(found.attitude) * robot.inv()).magnitude() < 5 * found.sigma_tilt
+    with pytest.raises(BadShape, match="mount: a quaternion of length 2"):
+        initial_from_standstill(rows, mount=[0, 0, 0, 0, 0, 0, 2])
+
+
 def test_a_draft_sends_the_samples_as_they_are() -> None:
     draft = Draft().imu(A, B, SAMPLES, noise=NOISE, gravity=(0, 0, -9.8), bias=[0.1] * 6, loss="huber")
     (group,) = draft.batch().factors
     kind = imu_kind(2)
     assert (group.kind, group.loss, group.measured.shape) == (kind.name, "huber", (1, kind.size))
-    np.testing.assert_array_equal(group.measured[0, : of.GRAVITY], [1e-3, 1e-2, 1e-5, 1e-4, 0])
-    np.testing.assert_array_equal(group.measured[0, of.GRAVITY : of.SAMPLES], [0, 0, -9.8, *[0.1] * 6])
-    np.testing.assert_array_equal(group.measured[0, of.SAMPLES :], SAMPLES.ravel())
+    np.testing.assert_array_equal(group.measured[0, : of.NOISE], [1e-3, 1e-2, 1e-5, 1e-4, 0])
+    known = [*[0.1] * 6, 0, 0, -9.8, 0, 0, 0, 0, 0, 0, 1]
+    np.testing.assert_array_equal(group.measured[0, of.NOISE : FORM.start], known)
+    np.testing.assert_array_equal(group.measured[0, FORM.start :], SAMPLES.ravel())
     np.testing.assert_array_equal(group.information[0], np.eye(15)[np.triu_indices(15)])
     (group,) = Draft().imu(A, B, SAMPLES, noise=NOISE, sigmas=[2.0] * 15).batch().factors
     np.testing.assert_array_equal(group.information[0], 0.25 * np.eye(15)[np.triu_indices(15)])
 
 
-def test_an_imu_that_is_turned_measures_along_the_robots_axes() -> None:
-    R = Rotation.from_euler("ZYX", [0.3, -0.2, 1.1])
-    own = np.column_stack([SAMPLES[:, 0], R.inv().apply(SAMPLES[:, 1:4]), R.inv().apply(SAMPLES[:, 4:])])
-    (group,) = Draft().imu(A, B, own, noise=NOISE, attitude=R.as_quat()).batch().factors
-    np.testing.assert_allclose(group.measured[0, of.SAMPLES :], SAMPLES.ravel(), atol=1e-12)
-    with pytest.raises(BadShape, match=r"attitude: .*length 2"):
-        Draft().imu(A, B, own, noise=NOISE, attitude=[0, 0, 0, 2.0])
+def test_a_mount_and_gravity_are_numbers_or_variables() -> None:
+    there = [1.0, 2, 3, 0, 0, 0, 1]
+    (group,) = Draft().imu(A, B, SAMPLES, noise=NOISE, mount=there).batch().factors
+    assert group.measured[0, FORM.mount_at : FORM.start].tolist() == there
+    for mount, gravity in ((there, "g0"), ("m0", (0, 0, -9.8)), ("m0", "g0")):
+        further = [key_number(key) for key in (mount, gravity) if isinstance(key, str)]
+        draft = Draft().imu(A, B, SAMPLES, noise=NOISE, mount=mount, gravity=gravity)
+        draft.imu_preintegrated(A, B, MADE, mount=mount, gravity=gravity)
+        for group, samples in zip(draft.batch().factors, (2, 0), strict=True):
+            form = of.ImuForm(samples, mount == "m0", gravity == "g0")
+            assert (group.kind, group.keys[0, 6:].tolist()) == (form.name, further)
+            assert group.measured.shape == (1, form.size)
 
 
-def moving(seed: int) -> tuple[MapGraph, Estimate]:
+def test_what_is_integrated_already_says_what_its_samples_say() -> None:
+    rng = np.random.default_rng(1)
+    form, sampled = of.ImuForm(0), of.ImuForm(40)
+    z = random_imu(sampled, rng, 0.5)
+    rows, bias = z[sampled.start :].reshape(-1, 7), z[of.NOISE : of.NOISE + 6]
+    made = preintegrate_samples(rows, ImuNoise(*NOISE_NUMBERS), bias)
+    ends = random_ends(sampled, z, rng, 0.01)
+    ends[2] = bias
+    (group,) = (
+        Draft()
+        .imu_preintegrated(
+            A, B, made, gravity=z[sampled.gravity_at : sampled.mount_at], mount=z[sampled.mount_at : sampled.start]
+        )
+        .batch()
+        .factors
+    )
+    r, wanted = residual(form.name, ends, group.measured[0]), residual(sampled.name, ends, z)
+    W = np.zeros((15, 15))
+    W[np.triu_indices(15)] = group.information[0]
+    W = W + np.triu(W, 1).T
+    assert r @ W @ r == pytest.approx(wanted @ wanted, rel=1e-6)
+    assert len(codec.encode_insert(Insert(1, Draft().imu_preintegrated(A, B, made).batch()))) < 2000
+    (loose,) = Draft().imu_preintegrated(A, B, made, sigmas=[2.0] * 15).batch().factors
+    np.testing.assert_array_equal(loose.information[0], 0.25 * np.eye(15)[np.triu_indices(15)])
+
+
+FORMS = [of.ImuForm(n, mount, gravity) for n in (0, 4) for mount in (False, True) for gravity in (False, True)]
+
+
+def moving(seed: int, form: of.ImuForm) -> tuple[MapGraph, Estimate]:
     """A map of two moments, whose velocity is known at the first, and one that it goes into."""
     rng = np.random.default_rng(seed)
-    z = random_imu(4, rng)
-    ends, keys = random_ends(z, rng, off=0.01), np.array(keys_of(0) + keys_of(1))
-    kinds = ("se3", "vector3", "vector6") * 2
-    variables = tuple(Variables(kind, keys[n : n + 1], ends[n][None], fixed=n == 0) for n, kind in enumerate(kinds))
+    z, kind = random_imu(form, rng), inertial_kind(form)
+    ends = random_ends(form, z, rng, off=0.01)
+    keys = np.array([*keys_of(0), *keys_of(1), *[MOUNT_KEY] * form.mount, *[GRAVITY_KEY] * form.gravity])
+    variables = tuple(
+        Variables(end, keys[n : n + 1], ends[n][None], fixed=n == 0) for n, end in enumerate(kind.connects)
+    )
     known = Draft().linear(
         ["v0"], [ends[1] + 0.1], [np.diag([1.0, 2, 3])], np.zeros(3), sigmas=(1, 1, 1), kinds=["vector3"]
     )
-    imu = Factors(imu_kind(4).name, keys[None], z[None], np.eye(15)[np.triu_indices(15)][None])
+    imu = Factors(kind.name, keys[None], z[None], np.eye(15)[np.triu_indices(15)][None])
     here = Variables("se3", np.array([1]), np.array([[0, 0, 0, 0, 0, 0, 1.0]]))
     return MapGraph(1, 1, Batch(variables, (imu, *known.batch().factors))), Estimate(2, 1, (here,))
 
@@ -127,12 +214,16 @@ def residuals(batch: Batch) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_velocities_and_gravity_turn_with_a_map_that_is_merged(seed: int) -> None:
-    other, here = moving(seed)
+@pytest.mark.parametrize("form", FORMS, ids=[form.name for form in FORMS])
+@pytest.mark.parametrize("seed", range(2))
+def test_velocities_and_gravity_turn_with_a_map_that_is_merged(seed: int, form: of.ImuForm) -> None:
+    other, here = moving(seed, form)
     frame = boxplus("se3", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.random.default_rng(seed).normal(size=6))
     fitted = fit_into(here, other, frame=frame, sigmas=[0.1] * 6, letters={"x": "y"})
-    assert keys_of_role(other.batch, AXES).tolist() == sorted([keys_of(0)[1], keys_of(1)[1]])
+    assert keys_of_role(other.batch, AXES).tolist() == sorted(
+        [keys_of(0)[1], keys_of(1)[1], *[GRAVITY_KEY] * form.gravity]
+    )
+    assert keys_of_role(other.batch, MOUNT).tolist() == [MOUNT_KEY] * form.mount
     before, after = residuals(other.batch), residuals(fitted.batch)
     assert set(before) == set(after)
     for kind, r in before.items():
@@ -142,7 +233,7 @@ def test_velocities_and_gravity_turn_with_a_map_that_is_merged(seed: int) -> Non
 
 def test_what_is_known_of_a_pose_and_its_velocity_is_of_the_map() -> None:
     """A marginal says where down is, and so where the map is."""
-    other, here = moving(1)
+    other, here = moving(1, of.ImuForm(4))
     rows = np.random.default_rng(1).normal(size=(3, 9))
     ends = [g.values[0] for g in other.batch.variables[3:5]]
     draft = Draft().linear(

@@ -255,7 +255,9 @@ def test_every_method_that_takes_a_certainty_is_among_them() -> None:
     }
     # An inverse-depth feature has a certainty of its own, `FeatureCertainty`; so has a receiver of GNSS, which takes
     # a covariance: see test_further; of an IMU it follows from the noise: see test_imu.  A variable has none (`Held`).
-    assert takes - {"idp_first", "gnss", "imu", "variable", "vector", *VARIABLE_KINDS} == set(EVERY_METHOD)
+    assert takes - {"idp_first", "gnss", "imu", "imu_preintegrated", "variable", "vector", *VARIABLE_KINDS} == set(
+        EVERY_METHOD
+    )
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)

@@ -12,7 +12,7 @@ MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset")
 def parts_of(kind: str) -> tuple[str, list[str]]:
     """The base kind, and what it is with."""
     words, modifiers = kind.split("_"), list[str]()
-    while words[-1] in MODIFIERS and words[0] != "velocity":
+    while words[-1] in MODIFIERS and words[0] not in ("velocity", "imu"):
         modifiers.insert(0, words.pop())
     return "_".join(words), modifiers
 

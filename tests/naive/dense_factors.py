@@ -10,6 +10,7 @@ from naive.dense_poses import plane_rotation, pose_matrix, pose_vector
 from scipy.spatial.transform import Rotation
 
 from factorbus.proto.camera import Camera
+from factorbus.proto.inertial import form_of_name
 
 TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3, "idp": 6}
 TANGENT |= {f"vector{n}": n for n in range(1, 10)}
@@ -38,10 +39,12 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
         return pose_matrix(ends[0])[:-1, :-1] @ ends[1] - z
     if kind in ("idp_first", "idp_seen", "point_seen"):
         return _observation(kind, *ends, z)
+    if kind == "length_vector3":
+        return np.array([np.linalg.norm(ends[0])]) - z
     if kind.startswith("linear"):
         return _linear(kind, ends, z)
     if kind.startswith("imu"):
-        return dense_imu.residual(ends, z)
+        return dense_imu.residual(form_of_name(kind), ends, z)
     if kind.startswith(("position", "heading", "attitude")):
         return _absolute(kind, ends[0], z)
     if kind.startswith("prior_point"):

@@ -4,6 +4,8 @@ import numpy as np
 from naive.dense_derived import parts_of
 from naive.dense_factors import TANGENT, boxplus, jacobians, linear_ends, residual
 
+from factorbus.proto.inertial import form_of_name
+
 
 class Connects(dict[str, list[str]]):
     """The kinds of the variables of each kind of factor; a linear one, or one with further variables, by its name; the
@@ -16,7 +18,7 @@ class Connects(dict[str, list[str]]):
             of = {"mount": space, "frame": space, "arm": "vector2" if space == "se2" else "vector3"}
             return [*self[base], *(of.get(modifier, "vector1") for modifier in modifiers)]
         if kind.startswith("imu_"):
-            return ["se3", "vector3", "vector6"] * 2
+            return list(form_of_name(kind).ends)
         assert kind.startswith("linear_"), kind
         return linear_ends(kind)
 
@@ -44,6 +46,7 @@ CONNECTS = Connects({
     "range_between_se3": ["se3", "se3"],
     "velocity_frame_se2": ["se2", "vector2"],
     "velocity_frame_se3": ["se3", "vector3"],
+    "length_vector3": ["vector3"],
     "bearing_se2": ["se2", "point2"],
     "bearing_se3": ["se3", "point3"],
 })  # fmt: skip

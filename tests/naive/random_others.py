@@ -10,7 +10,7 @@ from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-_BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se", "velocity")
+_BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se", "velocity", "length")
 # Of one variable, of two, and of more, with fewer rows than they have scalars, as many, and one more.
 LINEAR = (
     *("linear_3_se2", "linear_6_se3", "linear_2_point2", "linear_3_point3", "linear_6_idp", "linear_1_se3"),
@@ -29,6 +29,8 @@ def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random
     """What a factor of such a kind would measure at these values, with noise."""
     if kind.startswith("linear"):
         return _random_linear(kind, ends, noise, rng)
+    if kind == "length_vector3":
+        return np.array([np.linalg.norm(ends[0]) + noise * rng.normal()])
     T = pose_matrix(ends[0])
     n = len(T) - 1
     if kind.startswith("velocity"):

@@ -5,20 +5,32 @@ import pytest
 from naive.dense_covariances import DenseCovariance
 from naive.dense_factors import residual
 from naive.dense_least_squares import DenseGraph, distance, full
-from naive.random_imu import imu_steps, keys_of
+from naive.random_imu import GRAVITY_KEY, MOUNT_KEY, imu_steps, keys_of
 from naive.solver_parts import graph_in, keys_in, kinds_in, linearization_points
 
 from factorbus.proto import codec
+from factorbus.proto.inertial import ImuForm
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import FactorGroup, Options, Solver
+from factorbus.solver.changes.carrying import carry_along
 from factorbus.solver.changes.repair import find_loops
 from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.why import why_factor, why_variable
+from factorbus.solver.graph.factor_rows import variables_aside
+from factorbus.solver.kernels.model import layout as at
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
+FORMS = {
+    "samples": None,
+    "mounted": ImuForm(1),
+    "mount, gravity": ImuForm(1, True, True),
+    "gravity": ImuForm(1, False, True),
+    "preintegrated": ImuForm(0),
+    "preintegrated, mount, gravity": ImuForm(0, True, True),
+}
 
 
 def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
@@ -29,9 +41,9 @@ def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
     }
 
 
-def solved(seed: int, mode: str = "bayes-tree", steps: int = 6) -> Solver:
+def solved(seed: int, mode: str = "bayes-tree", steps: int = 6, form: ImuForm | None = None) -> Solver:
     solver = Solver(Options(mode=mode))
-    for batch in imu_steps(seed, steps):
+    for batch in imu_steps(seed, steps, of_form=form):
         solver.stage(batch)
         solver.step()
     solver.step(settle=True)
@@ -68,9 +80,10 @@ def apart(a: Solver, b: Solver) -> float:
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("loss", ["", "huber"])
-def test_the_settled_estimate_is_the_dense_optimum(loss: str, mode: str) -> None:
+@pytest.mark.parametrize("form", FORMS)
+def test_the_settled_estimate_is_the_dense_optimum(form: str, loss: str, mode: str) -> None:
     solver, twin = Solver(Options(mode=mode)), DenseGraph()
-    for batch in imu_steps(1, loss=loss):
+    for batch in imu_steps(1, loss=loss, of_form=FORMS[form]):
         first = solver.stage(batch)
         report = solver.step()
         assert first == len(twin.factors)
@@ -87,8 +100,9 @@ def test_the_settled_estimate_is_the_dense_optimum(loss: str, mode: str) -> None
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_covariances_are_those_of_the_dense_inverse(mode: str) -> None:
-    solver = solved(1, mode)
+@pytest.mark.parametrize("form", FORMS)
+def test_covariances_are_those_of_the_dense_inverse(form: str, mode: str) -> None:
+    solver = solved(1, mode, form=FORMS[form])
     twin, blocks, keys = dense(solver), CovarianceBlocks(solver.covariances.factored()), keys_in(solver)
     diagonal = blocks.diagonal()
     for v, key in enumerate(keys):
@@ -98,12 +112,13 @@ def test_covariances_are_those_of_the_dense_inverse(mode: str) -> None:
     close(blocks.joint(some), twin.joint([keys[v] for v in some]), 1e-6)
 
 
-def test_gates_and_gains_are_those_of_dense_matrices() -> None:
-    solver = solved(2)
+@pytest.mark.parametrize("form", FORMS)
+def test_gates_and_gains_are_those_of_dense_matrices(form: str) -> None:
+    solver = solved(2, form=FORMS[form])
     twin, blocks, k = dense(solver), CovarianceBlocks(solver.covariances.factored()), 0
     groups = [
         FactorGroup(g.kind, g.keys, g.measured, 0.1 * g.information)
-        for batch in list(imu_steps(2, 6))[4:]
+        for batch in list(imu_steps(2, 6, of_form=FORMS[form]))[4:]
         for g in batch.factors
     ]
     found = evaluate_candidates(blocks, groups)
@@ -129,8 +144,9 @@ def _by_id(solver: Solver) -> list[tuple[str, list[int], np.ndarray, np.ndarray]
     return [rows[each] for each in sorted(rows)]
 
 
-def test_why_accounts_for_it_as_for_any_factor() -> None:
-    solver = solved(1, steps=5)
+@pytest.mark.parametrize("form", FORMS)
+def test_why_accounts_for_it_as_for_any_factor(form: str) -> None:
+    solver = solved(1, steps=5, form=FORMS[form])
     twin, blocks, influence = dense(solver), CovarianceBlocks(solver.covariances.factored()), 0.0
     for factor, (kind, keys, z, W) in enumerate(_by_id(solver)):
         account = why_factor(blocks, factor)
@@ -151,10 +167,12 @@ def test_why_accounts_for_it_as_for_any_factor() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_what_is_marginalized_stays_known(mode: str) -> None:
-    """Of the moments that stay, estimate and covariance are what they were."""
-    solver = solved(3, mode)
-    gone, left = np.array(keys_of(0) + keys_of(1)), [key for n in range(2, 6) for key in keys_of(n)]
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_marginalized_stays_known(form: str, mode: str) -> None:
+    """Of the moments that stay, mount and gravity, estimate and covariance are what they were."""
+    solver = solved(3, mode, form=FORMS[form])
+    gone = np.array(keys_of(0) + keys_of(1))
+    left = [key for key in keys_in(solver) if key not in gone]
     before, sure = by_key(solver), dense(solver).joint(left)
     after, *_ = with_changes(solver, [Change("marginalize", keys=gone)], settle=True)
     assert all(distance(kind, row, before[key][1]) < 1e-8 for key, (kind, row) in by_key(after).items())
@@ -163,8 +181,9 @@ def test_what_is_marginalized_stays_known(mode: str) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_it_is_removed_weighed_and_gets_a_loss_as_any_factor(mode: str) -> None:
-    solver = solved(1, mode)
+@pytest.mark.parametrize("form", FORMS)
+def test_it_is_removed_weighed_and_gets_a_loss_as_any_factor(form: str, mode: str) -> None:
+    solver = solved(1, mode, form=FORMS[form])
     factor = next(n for n, (kind, *_) in enumerate(_by_id(solver)) if kind.startswith("imu"))
     ids = np.array([factor])
     for change in (
@@ -177,7 +196,7 @@ def test_it_is_removed_weighed_and_gets_a_loss_as_any_factor(mode: str) -> None:
         twin.put(after.estimate())
         assert report.chi2 == pytest.approx(twin.chi2(), rel=1e-6)
         assert twin.gauss_newton(iterations=1) < 1e-6
-        in_place = solved(1, mode)
+        in_place = solved(1, mode, form=FORMS[form])
         if try_change(in_place, [change]) is not None:
             in_place.step(settle=True)
             assert apart(after, in_place) < 1e-6
@@ -189,8 +208,9 @@ def test_it_is_removed_weighed_and_gets_a_loss_as_any_factor(mode: str) -> None:
     assert factor not in graph_in(solver).ids_of(find_loops(graph_in(solver))).tolist()
 
 
-def test_what_is_placed_takes_poses_along_and_leaves_velocities() -> None:
-    solver = solved(1)
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_placed_takes_poses_along_and_leaves_velocities(form: str) -> None:
+    solver = solved(1, form=FORMS[form])
     before, there = by_key(solver), np.array([[5.0, 0, 0, 0, 0, np.sin(0.2), np.cos(0.2)]])
     moved, *_ = with_changes(solver, [Change("place", keys=np.array([symbol("x", 0)]), kind="se3", values=there)])
     assert moved.chi2() != solver.chi2()
@@ -199,9 +219,28 @@ def test_what_is_placed_takes_poses_along_and_leaves_velocities() -> None:
     assert set(before) == set(by_key(moved))
 
 
+@pytest.mark.parametrize("form", ["mount, gravity", "preintegrated, mount, gravity"])
+def test_mount_and_gravity_stay_where_poses_are_taken_along(form: str) -> None:
+    graph = graph_in(solved(1, form=FORMS[form]))
+    n, m = int(graph.counts[at.VARIABLES]), int(graph.counts[at.FACTORS])
+    x0, x1, mount, gravity = (graph.find(key) for key in (symbol("x", 0), symbol("x", 1), MOUNT_KEY, GRAVITY_KEY))
+    values, there = graph.values.copy(), graph.var[:n, at.V_AT]
+    values[there[x0]] += 5.0
+    carried = carry_along(graph, values, np.arange(n) == x0, np.ones(n, bool), np.ones(m, bool)) - graph.values
+    assert carried[there[x1]] == pytest.approx(5.0)
+    assert not carried[there[mount] : there[mount] + 7].any()
+    assert not carried[there[gravity] : there[gravity] + 3].any()
+    assert variables_aside(graph.fac[:m]).tolist() == [mount]
+
+
 @pytest.mark.parametrize("mode", MODES)
-def test_a_state_goes_on_bit_for_bit(mode: str) -> None:
-    steps, solver, other = list(imu_steps(4)), Solver(Options(mode=mode)), Solver(Options(mode=mode))
+@pytest.mark.parametrize("form", FORMS)
+def test_a_state_goes_on_bit_for_bit(form: str, mode: str) -> None:
+    steps, solver, other = (
+        list(imu_steps(4, of_form=FORMS[form])),
+        Solver(Options(mode=mode)),
+        Solver(Options(mode=mode)),
+    )
     for batch in steps[:4]:
         solver.stage(batch)
         solver.step()
@@ -213,8 +252,9 @@ def test_a_state_goes_on_bit_for_bit(mode: str) -> None:
         assert a.values.tobytes() == b.values.tobytes()
 
 
-def test_it_goes_over_the_wire_and_comes_back_as_it_was_sent() -> None:
-    solver = solved(5)
+@pytest.mark.parametrize("form", FORMS)
+def test_it_goes_over_the_wire_and_comes_back_as_it_was_sent(form: str) -> None:
+    solver = solved(5, form=FORMS[form])
     came = codec.decode_insert(codec.encode_insert(Insert(1, sent(solver)))).batch
     other = Solver(Options())
     other.stage(came)

@@ -31,8 +31,8 @@ def test_these_are_the_kinds_that_place_nobody() -> None:
     assert FACTOR_MODELS.keys() - places == set(OTHERS) - set(LINEAR)
     batches = list(other_steps(1))
     there = {group.kind for batch in batches for group in batch.factors}
-    velocities = {"velocity_frame_se2", "velocity_frame_se3"}  # in the drives of test_derived_kinds
-    assert there >= set(OTHERS) - set(LINEAR) - velocities
+    vectors = {"velocity_frame_se2", "velocity_frame_se3", "length_vector3"}  # in the drives of test_derived_kinds
+    assert there >= set(OTHERS) - set(LINEAR) - vectors  # and of test_imu_in_maps
     assert {len(wire.FACTOR_KINDS[kind].connects) for kind in there & set(LINEAR)} == {1, 2, 3}
 
 

@@ -17,6 +17,7 @@ from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
+from factorbus.client.preintegration import Preintegrated, preintegrate_samples
 from factorbus.client.snapshot import Snapshot
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
@@ -43,6 +44,7 @@ __all__ = [
     "NoAnswerYet",
     "NotConverged",
     "PendingInsert",
+    "Preintegrated",
     "Problem",
     "Refused",
     "Snapshot",
@@ -51,4 +53,5 @@ __all__ = [
     "connect",
     "cut_samples",
     "initial_from_standstill",
+    "preintegrate_samples",
 ]

@@ -32,9 +32,10 @@ from factorbus.client.further import (
     with_information,
 )
 from factorbus.client.geodetic import enu
-from factorbus.client.imu import STANDARD_GRAVITY, ImuNoise, imu_factor, known_by_noise, moment, turned_samples
+from factorbus.client.imu import STANDARD_GRAVITY, ImuNoise, imu_factor, known_by_noise, moments
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.linear import linear_factor
+from factorbus.client.preintegration import Preintegrated, preintegrated_factor
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind, FactorKinds
 from factorbus.proto.messages import Batch
@@ -42,6 +43,7 @@ from factorbus.proto.problems import BadOption, BadShape, UnknownKind
 from factorbus.proto.symbols import format_symbol
 
 _Kind = TypeVar("_Kind")
+_DOWN = 0.0, 0.0, -STANDARD_GRAVITY
 
 
 class Draft:
@@ -228,24 +230,42 @@ class Draft:
         samples: ArrayLike,
         *,
         noise: ImuNoise,
-        gravity: ArrayLike = (0.0, 0.0, -STANDARD_GRAVITY),
+        gravity: Key | ArrayLike = _DOWN,
         bias: ArrayLike = (0.0,) * 6,
-        attitude: ArrayLike | None = None,
+        mount: Key | ArrayLike | None = None,
         **certainty: Unpack[Certainty],
     ) -> Draft:
-        """What an IMU measured between two moments, each a pose (se3), a velocity in the map (vector3) and a bias
-        (vector6): ("x0", "v0", "b0"), ("x1", "v1", "b1").  Those of the second without a value get it from this.
+        """What an IMU measured between two moments, each a pose (se3), the IMU's velocity in the map (vector3) and a
+        bias (vector6): ("x0", "v0", "b0"), ("x1", "v1", "b1").  Those of the second without a value get it from this.
 
         samples (n, 7), n up to 2000: duration (s), gyroscopes (rad/s), accelerometers (m/s²), as it measured them, from
         pose to pose (`cut_samples`); the service integrates them at every linearization.
-        gravity: in the map, m/s².  bias: where the noise of the samples is propagated, the best guess of it.
-        attitude: how the IMU is turned on the robot, qx qy qz qw; a bias is along the robot's axes then.
+        gravity: in the map, m/s², or the key of a vector3 (how long: the kind `length_vector3`).
+        bias: where the noise of the samples is propagated, the best guess of it.
+        mount: the IMU's pose on the robot, x y z qx qy qz qw, or the key of an se3; without, it is the robot's.
         How certain it is follows from the noise: sigmas= or information= are beside that, of a residual of sigma 1.
         """
-        keys = key_numbers([*moment("imu: first", first), *moment("imu: second", second)]).tolist()
-        where = " ".join(["imu", *map(format_symbol, keys)])
-        kind, row = imu_factor(where, turned_samples(where, samples, attitude), noise, gravity, bias)
-        return self.factor(kind, keys, row, **known_by_noise(certainty))
+        of = moments("imu", first, second, gravity, mount)
+        kind, row = imu_factor(of, samples, noise, bias)
+        return self.factor(kind, of.keys, row, **known_by_noise(certainty))
+
+    def imu_preintegrated(
+        self,
+        first: Sequence[Key],
+        second: Sequence[Key],
+        made: Preintegrated,
+        *,
+        gravity: Key | ArrayLike = _DOWN,
+        mount: Key | ArrayLike | None = None,
+        **certainty: Unpack[Certainty],
+    ) -> Draft:
+        """The same of samples that are integrated already (`preintegrate_samples`): fewer bytes, and to first order in
+        the bias.  Without sigmas= or information= (of radians, metres, m/s, and the change of the bias) it is as
+        certain as its covariance says."""
+        of = moments("imu_preintegrated", first, second, gravity, mount)
+        known = of_type(f"{of.where}: made", made, Preintegrated, "a Preintegrated")
+        kind, row = preintegrated_factor(of, known)
+        return self.factor(kind, of.keys, row, **known_by_noise(certainty, known.information))
 
     def linear(
         self,

@@ -3,14 +3,15 @@
     samples = cut_samples(times_s, gyroscope, accelerometer, 1.0, 1.1)
     Draft().imu(("x0", "v0", "b0"), ("x1", "v1", "b1"), samples, noise=ImuNoise(1e-3, 1e-2, 1e-5, 1e-4))
 
-Frames: what it measures is in the IMU's frame, which is that of the pose; velocities and gravity are along the axes of
-the map.  A bias is (gyroscopes, rad/s; accelerometers, m/s²).
+Frames: what it measures, and its bias, is in the IMU's frame, whose pose on the robot is its mount; velocities and
+gravity are along the axes of the map.  A bias is (gyroscopes, rad/s; accelerometers, m/s²).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,10 +19,11 @@ from numpy.typing import ArrayLike
 from factorbus.client.arguments import all_finite, as_numbers, checked_row, of_type, seen
 from factorbus.client.certainty import Certainty
 from factorbus.client.frames import rotation_of
-from factorbus.client.key_numbers import Key
+from factorbus.client.key_numbers import Key, key_numbers
 from factorbus.proto.arrays import F64
-from factorbus.proto.inertial import MOST_SAMPLES, RESIDUAL, SAMPLE, imu_name
+from factorbus.proto.inertial import BIAS, MOST_SAMPLES, RESIDUAL, SAMPLE, ImuForm
 from factorbus.proto.problems import BadOption, BadShape
+from factorbus.proto.symbols import format_symbol
 
 STANDARD_GRAVITY = 9.80665  # m/s²
 _UNIT = np.eye(RESIDUAL)[np.triu_indices(RESIDUAL)]
@@ -29,6 +31,7 @@ _UNIT = np.eye(RESIDUAL)[np.triu_indices(RESIDUAL)]
 _STILL = 0.05, 0.5
 # How far from gravity the mean acceleration at rest may be, m/s².
 _BIASED = 1.0
+_NOTHING, _IN_THE_MIDDLE = np.empty(0), np.array([0, 0, 0, 0, 0, 0, 1.0])
 _TOLERANCE = 1e-3  # how far a quaternion may be from unit length
 
 
@@ -60,8 +63,9 @@ class ImuNoise:
 class Standstill:
     """What an IMU tells while it stands still.
 
-    attitude (4,): of the pose in a map whose z axis is up, qx qy qz qw; about the vertical it is 0.
-    bias (6,): gyroscopes, rad/s; accelerometers, m/s²: what differs from gravity along the vertical, no more is seen.
+    attitude (4,): of the robot in a map whose z axis is up, qx qy qz qw; about the vertical it is 0.
+    bias (6,): along the axes of the IMU, gyroscopes, rad/s; accelerometers, m/s²: what differs from gravity along the
+    vertical, no more is seen.
     gravity (3,): in that map, m/s².
     sigma_gyroscope (3,): standard deviation of the first three numbers of the bias, rad/s.
     sigma_tilt: of the attitude about horizontal axes, radians, if accelerometers had no bias.
@@ -74,30 +78,50 @@ class Standstill:
     sigma_tilt: float
 
 
-def imu_factor(where: str, samples: ArrayLike, noise: ImuNoise, gravity: ArrayLike, bias: ArrayLike) -> tuple[str, F64]:
+class Moments(NamedTuple):
+    """The variables of an inertial factor, and what of gravity and the mount is none.
+
+    keys: poses, velocities and biases, the mount, gravity.  where: for an error.  gravity (3,), mount (7,), or ().
+    """
+
+    keys: list[int]
+    where: str
+    form: ImuForm
+    gravity: F64
+    mount: F64
+
+
+def moments(
+    kind: str, first: Sequence[Key], second: Sequence[Key], gravity: Key | ArrayLike, mount: Key | ArrayLike | None
+) -> Moments:
+    """The variables of a factor; a gravity or a mount that is a key is one.  Raises BadShape, BadSymbol, BadOption."""
+    keys = [*moment(f"{kind}: first", first), *moment(f"{kind}: second", second)]
+    has_mount, has_gravity = isinstance(mount, str | int), isinstance(gravity, str | int)
+    numbers = key_numbers([*keys, *[cast("Key", mount)] * has_mount, *[cast("Key", gravity)] * has_gravity]).tolist()
+    where = " ".join([kind, *map(format_symbol, numbers)])
+    g = _NOTHING if has_gravity else checked_row(f"{where}: gravity", cast("ArrayLike", gravity), 3)
+    m = _NOTHING if has_mount else _checked_mount(f"{where}: mount", cast("ArrayLike | None", mount))
+    return Moments(numbers, where, ImuForm(0, has_mount, has_gravity), g, m)
+
+
+def _checked_mount(what: str, mount: ArrayLike | None) -> F64:
+    """(7,): where there is none, the robot's pose."""
+    m = checked_row(what, _IN_THE_MIDDLE if mount is None else mount, 7)
+    if not abs(np.linalg.norm(m[3:]) - 1.0) <= _TOLERANCE:
+        raise BadShape(what, f"a quaternion of length {np.linalg.norm(m[3:]):g}", "1: x y z qx qy qz qw")
+    return m
+
+
+def imu_factor(of: Moments, samples: ArrayLike, noise: ImuNoise, bias: ArrayLike) -> tuple[str, F64]:
     """(kind, measurement) of a factor; see `Draft.imu`.  Raises BadShape, BadOption, NotFiniteNumbers."""
-    rows = _checked_samples(f"{where}: samples", samples)
-    sensor = of_type(f"{where}: noise", noise, ImuNoise, "an ImuNoise")
-    g, b = checked_row(f"{where}: gravity", gravity, 3), checked_row(f"{where}: bias", bias, 6)
+    rows = checked_samples(f"{of.where}: samples", samples)
+    sensor = of_type(f"{of.where}: noise", noise, ImuNoise, "an ImuNoise")
+    b = checked_row(f"{of.where}: bias", bias, BIAS)
     if len(rows) > MOST_SAMPLES:
         wanted = f"1 to {MOST_SAMPLES}; put a pose in between, or join samples in pairs"
-        raise BadShape(f"{where}: samples", len(rows), wanted)
-    return imu_name(len(rows)), np.concatenate([astuple(sensor), g, b, rows.ravel()])
-
-
-def turned_samples(where: str, samples: ArrayLike, attitude: ArrayLike | None) -> ArrayLike:
-    """The samples of an IMU with that attitude on the robot (qx qy qz qw), along the robot's axes.  Raises BadShape.
-
-    Exact, since the noise is the same along all axes.  Where it is beside the robot's middle, the poses have to be
-    those of the IMU.
-    """
-    if attitude is None:
-        return samples
-    quat = checked_row(f"{where}: attitude", attitude, 4)
-    if not abs(np.linalg.norm(quat) - 1.0) <= _TOLERANCE:
-        raise BadShape(f"{where}: attitude", f"length {np.linalg.norm(quat):g}", "1: qx qy qz qw")
-    rows, R = _checked_samples(f"{where}: samples", samples), rotation_of(np.concatenate([np.zeros(3), quat]))
-    return np.column_stack([rows[:, 0], rows[:, 1:4] @ R.T, rows[:, 4:] @ R.T])
+        raise BadShape(f"{of.where}: samples", len(rows), wanted)
+    row = np.concatenate([astuple(sensor), b, of.gravity, of.mount, rows.ravel()])
+    return ImuForm(len(rows), of.form.mount, of.form.gravity).name, row
 
 
 def cut_samples(
@@ -125,12 +149,15 @@ def cut_samples(
     return np.column_stack([held, *rates])[held > 0.0]
 
 
-def initial_from_standstill(samples: ArrayLike, gravity: float = STANDARD_GRAVITY) -> Standstill:
+def initial_from_standstill(
+    samples: ArrayLike, gravity: float = STANDARD_GRAVITY, mount: ArrayLike | None = None
+) -> Standstill:
     """Where down is, and the bias of the gyroscopes, by the samples (n, 7) of an IMU that stands still.
 
-    gravity: its magnitude, m/s².  Raises BadShape, NotFiniteNumbers, BadOption: it moves, or measures another gravity.
+    gravity: its magnitude, m/s².  mount: the IMU's pose on the robot, as of `Draft.imu`.
+    Raises BadShape, NotFiniteNumbers, BadOption: it moves, or measures another gravity.
     """
-    rows = _checked_samples("samples", samples)
+    rows = checked_samples("samples", samples)
     if len(rows) < 2:
         raise BadShape("samples", len(rows), "2 or more of standing still; a second of them is good")
     mean, spread = rows[:, 1:].mean(axis=0), rows[:, 1:].std(axis=0, ddof=1)
@@ -144,8 +171,9 @@ def initial_from_standstill(samples: ArrayLike, gravity: float = STANDARD_GRAVIT
         wanted = f"{gravity:g} ± {_BIASED:g} m/s²: specific force, which at rest points up"
         raise BadOption("samples", f"a mean acceleration of {size:.4g} m/s²", wanted)
     error = spread / np.sqrt(len(rows))
+    R = rotation_of(_checked_mount("mount", mount))
     return Standstill(
-        _upright(up / size),
+        _upright(R @ up / size),
         np.concatenate([mean[:3], up * (1.0 - gravity / size)]),
         np.array([0.0, 0.0, -gravity]),
         error[:3],
@@ -160,7 +188,7 @@ def _upright(up: F64) -> F64:
     return np.array([sr * cp, cr * sp, -sr * sp, cr * cp])
 
 
-def _checked_samples(what: str, samples: ArrayLike) -> F64:
+def checked_samples(what: str, samples: ArrayLike) -> F64:
     """(n, 7), n ≥ 1, each of some duration."""
     rows = all_finite(what, as_numbers(what, samples))
     if rows.ndim != 2 or rows.shape[1] != SAMPLE or not len(rows):
@@ -172,11 +200,11 @@ def _checked_samples(what: str, samples: ArrayLike) -> F64:
     return rows
 
 
-def known_by_noise(certainty: Certainty) -> Certainty:
-    """Ω of a residual that is whitened: one, where none is given."""
+def known_by_noise(certainty: Certainty, information: F64 = _UNIT) -> Certainty:
+    """With Ω where none is given: one, of a residual that is whitened."""
     if "sigmas" in certainty or "information" in certainty:
         return certainty
-    return {**certainty, "information": _UNIT}
+    return {**certainty, "information": information}
 
 
 def moment(what: str, keys: Sequence[Key]) -> Sequence[Key]:

@@ -16,15 +16,15 @@ def transform_factors(group: Factors, T_a_b: F64, roles: Roles) -> Factors:
     kind = FACTOR_KINDS[group.kind]
     if kind.is_linear:
         return transform_linear(group, T_a_b, roles)
-    if kind.samples:
-        return _transform_inertial(group, T_a_b)
+    if kind.imu:
+        return group if kind.imu.gravity else _transform_inertial(group, T_a_b, kind.imu.gravity_at)
     return _transform_first(group, T_a_b) if group.kind == "idp_first" else group
 
 
-def _transform_inertial(group: Factors, T_a_b: F64) -> Factors:
-    """Gravity turns with the map; what an IMU measures is in its own frame."""
+def _transform_inertial(group: Factors, T_a_b: F64, at: int) -> Factors:
+    """Gravity, measured from `at` on, turns with the map; what an IMU measures is in its own frame."""
     measured = group.measured.copy()
-    measured[:, GRAVITY : GRAVITY + 3] = measured[:, GRAVITY : GRAVITY + 3] @ rotation_of(T_a_b).T
+    measured[:, at : at + GRAVITY] = measured[:, at : at + GRAVITY] @ rotation_of(T_a_b).T
     return group._replace(measured=measured)
 
 

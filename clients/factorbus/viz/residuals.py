@@ -4,6 +4,7 @@ For colouring what is drawn; the solver has its own, compiled, and a test holds 
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -36,7 +37,9 @@ def _residual_of(kind: str) -> Callable[..., F64] | None:
         return _of_own(known.own)
     if known is not None and known.is_linear:
         return _linear(kind)
-    return inertial_residual if known is not None and known.samples else _RESIDUALS.get(kind)
+    if known is not None and known.imu is not None:
+        return partial(inertial_residual, known.imu)
+    return _RESIDUALS.get(kind)
 
 
 class Values:
@@ -210,6 +213,7 @@ _RESIDUALS: dict[str, Callable[..., F64]] = {
     "range_between_se3": lambda a, b, z: _distance(a, b, z, 3),
     "velocity_frame_se2": lambda f, v, z: _turned_in_plane(f, v) - z,
     "velocity_frame_se3": lambda f, v, z: _turned_in_space(f, v[:, :3]) - z,
+    "length_vector3": lambda v, z: np.linalg.norm(v[:, :3], axis=1)[:, None] - z,
     "bearing_se2": lambda a, p, z: _bearing_range(a, p, np.column_stack([z, z]))[:, :1],
     "bearing_se3": lambda a, p, z: _unit(_into_space(a, p)) - _unit(z),
 }

@@ -55,7 +55,8 @@ class FactorKind:
         """Whether it is known in the map's frame, and not of variables relative to each other."""
         if self.own:
             return moving_ends(self.own) is None
-        return len(self.connects) == 1 + len(self.modifiers) and "frame" not in self.modifiers
+        of_length = self.roles == ("axes",)  # the same in every frame
+        return len(self.connects) == 1 + len(self.modifiers) and "frame" not in self.modifiers and not of_length
 
     @property
     def is_linear(self) -> bool:
@@ -80,9 +81,9 @@ class FactorKind:
         return tuple("mount" if stays else "" for stays in on_robot)
 
     @property
-    def samples(self) -> int:
-        """How many samples of an IMU it has; 0: it is of no IMU."""
-        return inertial.samples_of(self.name) if self.name.startswith(inertial.PREFIX) else 0
+    def imu(self) -> inertial.ImuForm | None:
+        """Of a kind that is of an IMU what it is."""
+        return inertial.form_of_name(self.name) if self.name.startswith(inertial.PREFIX) else None
 
     @property
     def sees_landmark(self) -> bool:

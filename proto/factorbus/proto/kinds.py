@@ -53,18 +53,24 @@ def linear_kind(rows: int, ends: tuple[str, ...]) -> FactorKind:
     return FactorKind(name, ends, size, rows, measured, "Σ Hₙ (xₙ ⊟ yₙ) + b", (*y, *[0.25] * (size - values)))
 
 
-@lru_cache(maxsize=1024)
 def imu_kind(samples: int) -> FactorKind:
     """The kind of inertial factors with that many samples.  Raises ValueError: none, or too many."""
-    name, example = inertial.imu_name(samples), (*inertial.EXAMPLE, *inertial.EXAMPLE_SAMPLE * samples)
-    texts = inertial.MEASURED, inertial.DIFFERENCE
-    return FactorKind(name, inertial.ENDS, len(example), inertial.RESIDUAL, *texts, example, roles=inertial.ROLES)
+    if not samples:
+        raise ValueError(f"0 samples; wanted 1 to {inertial.MOST_SAMPLES}")
+    return inertial_kind(inertial.ImuForm(samples))
+
+
+@lru_cache(maxsize=1024)
+def inertial_kind(form: inertial.ImuForm) -> FactorKind:
+    """The kind of inertial factors of a form."""
+    texts = form.measured, form.residual
+    return FactorKind(form.name, form.ends, form.size, inertial.RESIDUAL, *texts, form.example, roles=form.roles)
 
 
 def _imu_of_name(name: str) -> FactorKind | None:
     """The inertial kind of that name; None: there is none."""
     try:
-        return imu_kind(inertial.samples_of(name))
+        return inertial_kind(inertial.form_of_name(name))
     except ValueError:
         return None
 
@@ -156,7 +162,7 @@ class FactorKinds(dict[str, FactorKind]):
             return (f"{LINEAR_NAME}, of up to {MOST_JOINED} variables",)
         for prefix, form, read in (
             (LINEAR, LINEAR_NAME, _read_linear),
-            (inertial.PREFIX, inertial.NAME, inertial.samples_of),
+            (inertial.PREFIX, inertial.NAME, inertial.form_of_name),
         ):
             if unknown.startswith(prefix):
                 try:
@@ -324,6 +330,9 @@ FACTOR_KINDS = FactorKinds(
             "R_f v − z, v along the axes of the map",
             (1.5, -0.5, 0.25),
             roles=("frame", "axes"),
+        ),
+        FactorKind(
+            "length_vector3", ("vector3",), 1, 1, "length (m/s² of gravity)", "‖x‖ − z", (9.8125,), roles=("axes",)
         ),
     )
 )

@@ -6,7 +6,7 @@ A pose that was placed moved by M = x' x⁻¹, and what hangs on it moves by the
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.factor_rows import rows_of_factors
+from factorbus.solver.graph.factor_rows import rows_of_factors, variables_aside
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import JOINS_PLACES, OF_FAMILY, VECTOR
@@ -29,7 +29,7 @@ def carry_along(graph: FactorGraph, values: F64, placed: np.ndarray, stays: np.n
     joins = JOINS_PLACES[fac[:, at.F_KIND]]  # the first two variables: a mount, say, is not in the map
     joins[rows_of_factors(fac, np.flatnonzero(OF_FAMILY[fac[:, at.F_KIND]]))] = True
     ends = fac[kept & (fac[:, at.F_J] >= 0) & joins][:, [at.F_I, at.F_J]]
-    ends = ends[~VECTOR[kind[ends]].any(axis=1)]
+    ends = ends[~(VECTOR[kind[ends]] | np.isin(ends, variables_aside(fac))).any(axis=1)]
     ends = np.concatenate([ends, ends[:, ::-1]])  # (from, to)
     ends = ends[np.argsort(~np.isin(kind[ends[:, 0]], _POSES), kind="stable")]  # a point turns nothing
     while True:

@@ -26,6 +26,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.expressions import BEHIND
 from factorbus.solver.kernels.model.kinds import CAMERA
+from factorbus.solver.kernels.model.preintegration import ROOM
 from factorbus.solver.sparse.anchors import find_undetermined
 
 # What nobody has any more of the payload or of the Hessians, as a share of all: with more everything is packed anew.
@@ -215,5 +216,5 @@ def _jacobian_size(graph: FactorGraph, row: int) -> int:
     if not ends or offset != rows - 1 or CAMERA[graph.fac[head, at.F_KIND]]:
         return 0
     kind = graph.kind_of(head)
-    size = kind.dim * (sum(end.dim for end in kind.connects) + 1) + BEHIND
+    size = kind.dim * (sum(end.dim for end in kind.connects) + 1) + BEHIND + (ROOM if kind.code == at.IMU else 0)
     return size if size <= JACOBIAN * rows else 0

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorbus.proto.inertial import MOMENTS
 from factorbus.solver import errors
 from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.requested import unchanged
@@ -104,7 +105,8 @@ def find_loops(graph: FactorGraph) -> I64:
         if j < 0 or not JOINS_PLACES[fac[f, at.F_KIND]]:
             continue
         if OF_FAMILY[fac[f, at.F_KIND]] and len(ends := graph.ends_of(f)) > 2:
-            for v in ends[1:]:
+            is_inertial = fac[f, at.F_KIND] in (at.IMU, at.PREINTEGRATED)
+            for v in ends[1 : MOMENTS if is_inertial else None]:  # robots may share gravity, as they do no place
                 _join(above, ends[0], v)
         elif not _join(above, i, j):
             loops.append(f)

@@ -15,7 +15,7 @@ from factorbus.solver.graph.factors import (
     FACTOR_KIND_OF_CODE,
     LOSS_OF_CODE,
     FactorKind,
-    imu_of,
+    imu_of_size,
     kinds_by_number,
     linear_of,
 )
@@ -154,9 +154,9 @@ def _kind_of(graph: FactorGraph, raw: bytes, group: I64) -> FactorKind:
     if code == at.OWN:
         own = floats_at(raw, int(group[gt.G_HEAD]), int(group[gt.G_LENGTH]))
         return kinds_by_number(graph.own)[int(own[X_NUMBER])]
-    if code == at.IMU:
-        return imu_of((int(group[gt.G_SIZE]) - inertial.SAMPLES) // inertial.SAMPLE)
     ends = ints_at(raw, int(group[gt.G_ENDS]), int(group[gt.G_ARITY]))
+    if code in (at.IMU, at.PREINTEGRATED):
+        return imu_of_size(code == at.PREINTEGRATED, ends, int(group[gt.G_SIZE]))
     return linear_of(int(group[gt.G_ROWS]), tuple(ends.tolist()))
 
 
@@ -190,7 +190,10 @@ def _bad_factor(
     if wrong == gt.BAD_DIRECTION:
         return errors.BadDirection(where)
     if wrong == gt.BAD_DURATION:
-        durations = measured[inertial.SAMPLES :: inertial.SAMPLE]
+        form = inertial.form_of_name(kind.name)
+        if not form.samples:
+            return errors.BadSamples(where, f"a duration of {measured[form.start]:g} s", "more than 0 s")
+        durations = measured[form.start :: inertial.SAMPLE]
         sample = int(np.flatnonzero(~(durations > 0.0))[0])
         return errors.BadSamples(where, f"sample {sample} lasts {durations[sample]:g} s", "more than 0 s")
     if wrong == gt.BAD_NOISE:
@@ -204,7 +207,7 @@ def _bad_factor(
 
 def _bad_noise(where: str, measured: F64) -> errors.SolverError:
     """A noise density is not positive, or the covariance of Δ is singular, as that of one sample is."""
-    noise = measured[: inertial.GRAVITY]
+    noise = measured[: inertial.NOISE]
     if (noise[: inertial.INTEGRATION] > 0.0).all() and noise[inertial.INTEGRATION] >= 0.0:
         seen = f"the covariance of Δ is singular with noise of integration {noise[inertial.INTEGRATION]:g} m/√s"
         return errors.BadSamples(where, seen, "a larger one, 1e-4 say, or more samples")
@@ -220,6 +223,9 @@ def _worst_norm(kind: FactorKind, measured: F64) -> float:
         for end in kind.connects:
             starts += [here + 3] if end.name == "se3" else []
             here += end.size
+    if kind.code in (at.IMU, at.PREINTEGRATED):
+        form = inertial.form_of_name(kind.name)
+        starts = [*[form.mount_at + 3] * (not form.mount), *[form.start + 1] * (not form.samples)]
     if kind.own:
         starts = [{"so3": 0}.get(str(kind.own.measured), 3)]
     norms = [float(np.linalg.norm(measured[start : start + 4])) for start in starts]

@@ -274,8 +274,9 @@ class FactorGraph(Arenas):
             return FACTOR_KIND_OF_CODE[code]
         if code == at.OWN:
             return kinds_by_number(self.own)[int(self.payload[self.fac[row, at.F_AT] + X_NUMBER])]
-        if code == at.IMU:
-            return imu_of(flags >> at.SAMPLES_SHIFT & at.SAMPLES_MASK)
+        if code in (at.IMU, at.PREINTEGRATED):
+            mounted, ends = bool(flags & at.MOUNTED), flags >> at.ENDS_SHIFT & at.ENDS_MASK
+            return imu_of(flags >> at.SAMPLES_SHIFT & at.SAMPLES_MASK, mounted, ends)
         return linear_of(flags >> at.DIM_SHIFT, tuple(self.var[self.ends_of(row), at.V_KIND].tolist()))
 
     def kinds_of(self, rows: I64) -> list[tuple[FactorKind, I64]]:

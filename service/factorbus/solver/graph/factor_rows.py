@@ -5,6 +5,7 @@ A factor of more than two variables has a row for each pair of them (`kernels/mo
 
 import numpy as np
 
+from factorbus.proto.inertial import MOMENTS
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import ASIDE_END
@@ -73,7 +74,7 @@ def are_of_many(fac: I64) -> np.ndarray:
 
 def variables_aside(fac: I64) -> I64:
     """The poses that are no places in the map: mounts of sensors, and the map's poses in other frames."""
-    end = ASIDE_END[fac[:, at.F_KIND]]
+    end = np.where(fac[:, at.F_FLAGS] & at.MOUNTED != 0, MOMENTS, ASIDE_END[fac[:, at.F_KIND]])
     rows = np.flatnonzero(end >= 0)
     end = end[rows]
     return np.unique(np.where(end == 0, fac[rows, at.F_I], fac[rows + np.maximum(end - 1, 0), at.F_J]))

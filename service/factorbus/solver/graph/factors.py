@@ -14,7 +14,7 @@ from factorbus.proto import kinds as wire
 from factorbus.proto.expressions.declaration import Declaration
 from factorbus.solver.formulas.own_code import number_of, own_head
 from factorbus.solver.graph.variables import VARIABLE_KINDS, VariableKind
-from factorbus.solver.kernels.jit.compile import F64
+from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout
 from factorbus.solver.kernels.model.kinds import FACTOR_MODELS
 
@@ -71,8 +71,10 @@ def _kind(kind: wire.FactorKind) -> FactorKind:
     kept = 0
     if kind.own:
         code, equation = layout.OWN, "MATH §3.11"
-    elif kind.samples:
+    elif kind.imu and kind.imu.samples:
         code, equation, kept = layout.IMU, "MATH (3.48)", inertial.KEPT
+    elif kind.imu:
+        code, equation = layout.PREINTEGRATED, "MATH (3.60)"
     elif kind.is_linear:
         code, equation = layout.LINEAR, "MATH (3.26)"
     else:
@@ -101,9 +103,16 @@ def linear_of(rows: int, ends: tuple[int, ...]) -> FactorKind:
     return _of_family("_".join(["linear", str(rows), *(_VARIABLE_NAMES[code] for code in ends)]))
 
 
-def imu_of(samples: int) -> FactorKind:
-    """The kind of inertial factors with that number of samples."""
-    return _of_family(inertial.imu_name(samples))
+def imu_of(samples: int, mounted: bool, ends: int) -> FactorKind:
+    """The kind of inertial factors with that number of samples and variables; mounted: the mount is one of them."""
+    return _of_family(inertial.ImuForm(samples, mounted, ends > inertial.MOMENTS + mounted).name)
+
+
+def imu_of_size(preintegrated: bool, ends: I64, size: int) -> FactorKind:
+    """The same of variables of kinds with these codes and a measurement of that size."""
+    mounted = ends.size > inertial.MOMENTS and int(ends[inertial.MOMENTS]) == layout.SE3
+    one = inertial.ImuForm(1, mounted, ends.size > inertial.MOMENTS + mounted)
+    return imu_of(0 if preintegrated else (size - one.start) // inertial.SAMPLE, mounted, ends.size)
 
 
 @lru_cache(maxsize=64)

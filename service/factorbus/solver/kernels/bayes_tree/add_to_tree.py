@@ -6,7 +6,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import chi2_of_factor, heading_of
 from factorbus.solver.kernels.bayes_tree.hessian import linearize_factor, weigh_factor
-from factorbus.solver.kernels.bayes_tree.hessian_room import jacobian_size, last_of_hessian
+from factorbus.solver.kernels.bayes_tree.hessian_room import jacobian_size, kept_samples, last_of_hessian
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
@@ -72,7 +72,7 @@ def add_factors(graph: Graph, tree: Tree, f1: int) -> bool:
             link[f, tl.L_KIND] = tl.EXACT
             state[tl.S_EXACT] += 1
         if not is_member(f, fac):
-            place_hessians(f, var, fac, link, state)
+            place_hessians(f, var, fac, tree)
         linearize_factor(graph, tree, f, scratch)
         _save(i, saved[2 * (f - f0)], var, node, scalars, turns)
         if j >= 0:
@@ -100,12 +100,14 @@ def add_factors(graph: Graph, tree: Tree, f1: int) -> bool:
 
 
 @inline_kernel
-def place_hessians(f: int, var: I64, fac: I64, link: I64, state: I64) -> None:
+def place_hessians(f: int, var: I64, fac: I64, tree: Tree) -> None:
     """Room for the Hessians of all rows of the factor that begins at row f, and for what is kept of its Jacobian."""
+    link, state = tree.link, tree.state
     for row in range(f, f + rows_of(f, fac)):
         link[row, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] = last_of_hessian(row, var, fac, link) + 1
     state[tl.S_HESSIAN] += jacobian_size(f, var, fac)
+    kept_samples(f, var, fac, tree)[:] = 0.0  # none are yet
 
 
 @inline_kernel

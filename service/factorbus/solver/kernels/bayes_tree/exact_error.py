@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from factorbus.solver.kernels.bayes_tree.hessian_room import copy_linear, jacobian_at, jacobian_size
+from factorbus.solver.kernels.bayes_tree.hessian_room import copy_linear, jacobian_at, jacobian_size, kept_samples
 from factorbus.solver.kernels.bayes_tree.own_error import exact_error_of_own
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, part
@@ -14,7 +14,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import end_of, is_one_of_many
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import evaluate_apart
-from factorbus.solver.kernels.model.many import linearize_many, square_of
+from factorbus.solver.kernels.model.many import linearize_kept, linearize_many, square_of
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
@@ -66,7 +66,7 @@ def exact_error(f: int, graph: Graph, tree: Tree) -> tuple[float, float, float]:
 def exact_error_of_many(f: int, graph: Graph, tree: Tree) -> tuple[float, float, float]:
     """The same of a factor that `many` evaluates."""
     var, fac, payload, kind = graph.var, graph.fac, graph.payload, graph.fac[f, at.F_KIND]
-    more, now = linearize_many(f, var, fac, graph.values, payload)
+    more, now = linearize_kept(f, var, fac, graph.values, payload, kept_samples(f, var, fac, tree))
     dim, columns = now.J.shape
     chi2, switched = more + square_of(now), False
     if jacobian_size(f, var, fac) != 0:

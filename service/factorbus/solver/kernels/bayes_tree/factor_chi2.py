@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.hessian_room import kept_samples
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
@@ -37,7 +38,7 @@ def chi2_of_factor(graph: Graph, tree: Tree, f: int, kind: int, c: float, s: flo
         return landmark_se2_chi2(f, c, s, var, fac, values, payload), 0.0, 0.0
     if kind == at.BETWEEN_SE3:
         return between_se3_chi2(f, var, fac, values, payload)
-    return any_chi2(f, var, fac, values, payload), 0.0, 0.0
+    return any_chi2(f, graph, tree), 0.0, 0.0
 
 
 @inline_kernel
@@ -95,10 +96,11 @@ def between_se3_chi2(f: int, var: I64, fac: I64, x: F64, p: F64) -> tuple[float,
 
 
 @part
-def any_chi2(f: int, var: I64, fac: I64, values: F64, payload: F64) -> float:
+def any_chi2(f: int, graph: Graph, tree: Tree) -> float:
     """By the kernel of the kind, with the loss of the factor."""
+    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
     if is_one_of_many(f, fac):
-        return chi2_of_many(f, var, fac, values, payload)
+        return chi2_of_many(f, var, fac, values, payload, kept_samples(f, var, fac, tree))
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     total, kind = evaluate_apart(f, var, fac, values, payload, r, A, B), fac[f, at.F_KIND]
     dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)

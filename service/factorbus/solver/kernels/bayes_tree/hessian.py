@@ -6,7 +6,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import has_free
 from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, shift_error_weight
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_isotropic
-from factorbus.solver.kernels.bayes_tree.hessian_room import hessian_size, keep_jacobian
+from factorbus.solver.kernels.bayes_tree.hessian_room import hessian_size, keep_jacobian, kept_samples
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import Panel, put, six, zero
@@ -15,7 +15,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, row_of_pair
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, multiply
-from factorbus.solver.kernels.model.many import Many, linearize_many, square_of, width_of
+from factorbus.solver.kernels.model.many import Many, linearize_kept, square_of, width_of
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
@@ -62,7 +62,7 @@ def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
     of the first one and χ² too; what else there is room for is zero.  So the sum of the rows is the factor.
     """
     var, fac, out, link, state, totals = graph.var, graph.fac, tree.hessian, tree.link, tree.state, tree.totals
-    more, many = linearize_many(f, var, fac, tree.lin[0], graph.payload)
+    more, many = linearize_kept(f, var, fac, tree.lin[0], graph.payload, kept_samples(f, var, fac, tree))
     ends, last = many.start.size - 1, link[f, tl.L_AT] + hessian_size(width_of(0, many), width_of(1, many)) - 1
     was = load(out, last)
     for n in range(max(ends - 1, 1)):

@@ -1,7 +1,9 @@
 """Where the Hessian of a factor is, and behind it the Jacobian that it was made of.
 
 Of a factor that `many` evaluates r and J at the linearization points are kept, whitened, while they are of a usual
-size: its linearization error, (9.11), is computed at every step in which it moves, and needs both.
+size: its linearization error, (9.11), is computed at every step in which it moves, and needs both.  Behind them is, of
+samples of an IMU, what these were integrated to last, and at which bias: where that has the same bits, at the
+linearization points as at the estimate, in a step as in the next, they are not integrated again.
 """
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -13,6 +15,7 @@ from factorbus.solver.kernels.model.expressions import BEHIND, evaluate_linear
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_one_of_many, residual_size, rows_of
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.many import Many
+from factorbus.solver.kernels.model.preintegration import ROOM
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import MOST_SCALARS, dim_of
 
@@ -44,8 +47,17 @@ def jacobian_size(f: int, var: I64, fac: I64) -> int:
     columns = 0
     for n in range(count_ends(f, fac)):
         columns += dim_of(var[end_of(f, n, fac), at.V_KIND])
-    size = residual_size(f, fac) * (columns + 1) + BEHIND
+    size = residual_size(f, fac) * (columns + 1) + BEHIND + (ROOM if fac[f, at.F_KIND] == at.IMU else 0)
     return size if size <= JACOBIAN * rows_of(f, fac) else 0
+
+
+@inline_kernel
+def kept_samples(f: int, var: I64, fac: I64, tree: Tree) -> F64:
+    """Room (ROOM,) for what the samples of factor f are integrated to; (0,) of all others."""
+    if fac[f, at.F_KIND] != at.IMU:
+        return tree.hessian[:0]
+    k = jacobian_at(f, var, fac, tree.link) + jacobian_size(f, var, fac)
+    return tree.hessian[k - ROOM : k]
 
 
 @inline_kernel

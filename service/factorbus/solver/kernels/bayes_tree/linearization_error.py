@@ -173,13 +173,13 @@ def evaluate_factor(
     Gives the error; by what χ² is more than before; the sum of both, and of error² now and before; by what error² in
     full and as it counts is more.
     """
-    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
+    var, fac = graph.var, graph.fac
     node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
     error, full, leaves = 0.0, 0.0, 0.0
     kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
     if not is_bounded(kind) or kind == at.PRIOR_SE3 or loss_code(f, fac) != at.NO_LOSS:
         if how < MODEL:
-            chi2 = any_chi2(f, var, fac, values, payload)
+            chi2 = any_chi2(f, graph, tree)
         else:
             error, force, chi2 = exact_error(f, graph, tree)
             error = min(error, MOST_ERROR)

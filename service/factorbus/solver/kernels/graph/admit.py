@@ -23,6 +23,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find_outside
 from factorbus.solver.kernels.model.expression_layout import X_RIGID
 from factorbus.solver.kernels.model.factor_rows import row_of_pair, rows_of_arity
+from factorbus.solver.kernels.model.imu_layout import ImuLayout, imu_layout
 from factorbus.solver.kernels.model.kinds import base_kind, is_camera
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import (
@@ -182,8 +183,8 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
             numbers += 1
         if is_many:
             append_factor_rows(kind, loss, dim, ends, numbers, graph)
-            if kind == at.IMU:
-                add_samples(size, len(ends), graph)
+            if kind == at.IMU or kind == at.PREINTEGRATED:
+                mark_imu(imu_form(kind, kinds, size), len(ends), graph)
         else:
             append_factor(kind, loss, i, j, numbers, graph)
     return -1, gt.GOOD, rest
@@ -196,14 +197,26 @@ def check_measured(kind: int, kinds: I64, p: int, size: int, payload: F64) -> in
         return check_linear(kinds, p, size, payload)
     if kind == at.OWN:
         return check_own_measurement(p, payload)
-    return check_imu(p, size, payload) if kind == at.IMU else check_measurement(kind, p, payload)
+    if kind == at.IMU or kind == at.PREINTEGRATED:
+        return check_imu(imu_form(kind, kinds, size), p, payload)
+    return check_measurement(kind, p, payload)
 
 
 @inline_kernel
-def add_samples(size: int, ends: int, graph: Graph) -> None:
-    """The newest factor is an inertial one with a measurement of that size."""
+def imu_form(kind: int, kinds: I64, size: int) -> ImuLayout:
+    """How a measurement of that size lies, of an inertial kind with variables of these kinds."""
+    is_mounted = kinds.size > inertial.MOMENTS and kinds[inertial.MOMENTS] == at.SE3
+    if kind == at.PREINTEGRATED:
+        return imu_layout(0, is_mounted, kinds.size)
+    before = imu_layout(1, is_mounted, kinds.size).start
+    return imu_layout((size - before) // inertial.SAMPLE, is_mounted, kinds.size)
+
+
+@inline_kernel
+def mark_imu(form: ImuLayout, ends: int, graph: Graph) -> None:
+    """The newest factor is an inertial one of that form."""
     first = graph.counts[at.FACTORS] - rows_of_arity(ends)
-    graph.fac[first, at.F_FLAGS] |= (size - inertial.SAMPLES) // inertial.SAMPLE << at.SAMPLES_SHIFT
+    graph.fac[first, at.F_FLAGS] |= form.samples << at.SAMPLES_SHIFT | (at.MOUNTED if form.mount >= 0 else 0)
 
 
 @inline_kernel

@@ -17,6 +17,7 @@ from factorbus.solver.kernels.model.bounds import (
     are_within,
 )
 from factorbus.solver.kernels.model.expression_layout import X_BEFORE, X_QUATERNION, X_WIDTH
+from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.imu_noise import write_root
 from factorbus.solver.kernels.model.kinds import direction_at, positive_at, quaternion_at
 from factorbus.solver.kernels.model.se2 import wrap
@@ -68,20 +69,26 @@ def check_own_measurement(p: int, payload: F64) -> int:
 
 
 @part
-def check_imu(p: int, size: int, payload: F64) -> int:
-    """What is wrong with a new inertial measurement of that size, which starts at p; W is written behind it."""
+def check_imu(form: ImuLayout, p: int, payload: F64) -> int:
+    """What is wrong with a new inertial measurement of that form, which starts at p; W is written behind samples."""
+    size = form.start + (inertial.SAMPLE * form.samples if form.samples > 0 else inertial.DELTA)
     if not are_within(MOST_NUMBER, p, size, payload):
         return gt.OUT_OF_BOUNDS
+    if form.mount < 0 and not normalize_quaternion(payload, p + form.mount_at + 3):
+        return gt.BAD_QUATERNION
+    if form.samples == 0:
+        if not payload[p + form.start] > 0.0:
+            return gt.BAD_DURATION
+        return gt.GOOD if normalize_quaternion(payload, p + form.start + 1) else gt.BAD_QUATERNION
     for n in range(inertial.INTEGRATION):
         if not payload[p + n] > 0.0:
             return gt.BAD_NOISE
     if not payload[p + inertial.INTEGRATION] >= 0.0:
         return gt.BAD_NOISE
-    for k in range(p + inertial.SAMPLES, p + size, inertial.SAMPLE):
+    for k in range(p + form.start, p + size, inertial.SAMPLE):
         if not payload[k] > 0.0:
             return gt.BAD_DURATION
-    samples = (size - inertial.SAMPLES) // inertial.SAMPLE
-    is_certain = not write_root(samples, payload[p:], size, payload[p:])
+    is_certain = not write_root(form, payload[p:], size, payload[p:])
     return gt.BAD_NOISE if is_certain or not are_within(MOST_LINEAR, p + size, inertial.KEPT, payload) else gt.GOOD
 
 

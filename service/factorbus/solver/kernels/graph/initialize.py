@@ -19,7 +19,7 @@ from factorbus.solver.kernels.model.composed import (
     put_measurement,
     put_sensor,
 )
-from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of, is_one_of_many, sample_count
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, form_of_imu, head_of, is_one_of_many
 from factorbus.solver.kernels.model.imu import BIAS_B, POSE_B, place_by_imu
 from factorbus.solver.kernels.model.kinds import SCALE, base_kind, end_of_modifier, initializes
 from factorbus.solver.kernels.model.records import Graph, graph_at
@@ -128,7 +128,7 @@ def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F
     A mount, a scale or a clock's offset follows from nothing, and all else from it.
     """
     of, count, missing = base_kind(fac[f, at.F_KIND]), 0, -1
-    if fac[f, at.F_KIND] == at.IMU:
+    if fac[f, at.F_KIND] == at.IMU or fac[f, at.F_KIND] == at.PREINTEGRATED:
         return follow_imu(compose, f, v0, var, fac, x, p, reached)
     if of < 0 or not initializes(of):  # a linear factor
         return _NOTHING
@@ -176,23 +176,24 @@ def compose_base(f: int, missing: int, between: bool, var: I64, fac: I64, x: F64
 
 @part
 def follow_imu(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
-    """The same of an inertial factor: pose, velocity and bias at its end follow from those at its beginning, one with
-    each of its rows, and nothing the other way."""
-    missing = -1
-    for n in range(BIAS_B, -1, -1):
+    """The same of an inertial factor: pose, velocity and bias at its end follow from those at its beginning, its
+    mount and gravity, one with each of its rows, and nothing the other way."""
+    missing, waits = -1, False
+    for n in range(count_ends(f, fac) - 1, -1, -1):
         v = end_of(f, n, fac)
         if v >= v0 and reached[v - v0] == 0:
             missing = n
+            waits |= n < POSE_B or n > BIAS_B
     if missing < 0:
         return _NOTHING
-    if missing < POSE_B:
+    if waits:
         return _WAITS
     new = end_of(f, missing, fac)
     if compose:
-        places = np.empty(BIAS_B + 1, np.int64)
-        for n in range(BIAS_B + 1):
+        places = np.empty(count_ends(f, fac), np.int64)
+        for n in range(places.size):
             places[n] = var[end_of(f, n, fac), at.V_AT]
-        place_by_imu(missing, x, places, sample_count(f, fac), p[fac[f, at.F_AT] :])
+        place_by_imu(missing, x, places, form_of_imu(f, fac), p[fac[f, at.F_AT] :])
     reached[new - v0] = 1
     return new
 

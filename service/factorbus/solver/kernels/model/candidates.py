@@ -42,7 +42,7 @@ def evaluate_many(f: int, graph_table: I64, values: F64, r: F64, J: F64, W: F64)
     """
     graph = graph_at(graph_table)
     var, fac, payload = graph.var, graph.fac, graph.payload
-    more, many = evaluate_plain(f, var, fac, values, payload)
+    more, many = evaluate_plain(f, var, fac, values, payload, payload[:0])
     dim, p = len(W), information_start(f, var, fac, payload)
     own, k = 0.0, p
     for a in range(dim):

@@ -18,7 +18,7 @@ def sum_chi2(first: int, last: int, var: I64, fac: I64, values: F64, payload: F6
     for f in range(first, last):
         if is_one_of_many(f, fac):
             if not is_member(f, fac):
-                chi2 += chi2_of_many(f, var, fac, values, payload)
+                chi2 += chi2_of_many(f, var, fac, values, payload, payload[:0])
             continue
         chi2 += evaluate_apart(f, var, fac, values, payload, r, A, B)
         kind = fac[f, at.F_KIND]

@@ -9,10 +9,10 @@ Such factors, linear ones, and those of clients' own kinds are evaluated by `man
 variables and numbers of a residual they have, and of an inertial one how many samples.
 """
 
-from factorbus.proto import inertial
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.expression_layout import X_BEFORE
+from factorbus.solver.kernels.model.imu_layout import ImuLayout, imu_layout, numbers_of_imu
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim, size_of
 
 
@@ -63,9 +63,10 @@ def residual_size(f: int, fac: I64) -> int:
 
 
 @inline_kernel
-def sample_count(f: int, fac: I64) -> int:
-    """How many samples the inertial factor has that begins at row f."""
-    return fac[f, at.F_FLAGS] >> at.SAMPLES_SHIFT & at.SAMPLES_MASK
+def form_of_imu(f: int, fac: I64) -> ImuLayout:
+    """How the measurement of the inertial factor lies that begins at row f."""
+    flags = fac[f, at.F_FLAGS]
+    return imu_layout(flags >> at.SAMPLES_SHIFT & at.SAMPLES_MASK, flags & at.MOUNTED != 0, count_ends(f, fac))
 
 
 @part
@@ -75,8 +76,8 @@ def information_start(f: int, var: I64, fac: I64, payload: F64) -> int:
     start, kind = fac[f, at.F_AT], fac[f, at.F_KIND]
     if kind == at.OWN:
         return start + int(payload[start + X_BEFORE])
-    if kind == at.IMU:
-        return start + inertial.SAMPLES + inertial.SAMPLE * sample_count(f, fac) + inertial.KEPT
+    if kind == at.IMU or kind == at.PREINTEGRATED:
+        return start + numbers_of_imu(form_of_imu(f, fac))
     if kind != at.LINEAR:
         return start + information_at(kind)
     values = scalars = 0

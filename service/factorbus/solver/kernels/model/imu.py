@@ -1,12 +1,14 @@
 """What an IMU says between two poses: residual and Jacobians.  MATH §3.10.
 
-Variables a: pose, velocity in the map (m/s), bias (gyroscopes, rad/s, accelerometers, m/s²), and the same of b.  With
-Δ = (ΔR, Δp, Δv) of the samples at the bias βₐ, their duration T and gravity g,
+Variables a: pose, velocity of the IMU in the map (m/s), bias (gyroscopes, rad/s, accelerometers, m/s²), and the same of
+b; then the mount m of the IMU, then gravity g, where these are variables.  With Δ = (ΔR, Δp, Δv) at the bias βₐ, its
+duration T, and (t, R) the poses of the IMU, a ∘ m and b ∘ m,
 
     r_R = log(ΔRᵀ Rₐᵀ R_b)                                                                               (3.47)
     r_p = Rₐᵀ (t_b − tₐ − vₐ T − ½ g T²) − Δp,   r_v = Rₐᵀ (v_b − vₐ − g T) − Δv,   r_β = β_b − βₐ         (3.48)
 
-The residual is W (r_R, r_p, r_v) and r_β / (σ √T), so that its Ω is one: W of `imu_noise`, kept behind the measurement.
+Of samples the residual is W (r_R, r_p, r_v) and r_β / (σ √T), so that its Ω is one: W of `imu_noise`, kept behind the
+measurement.  Of what is integrated already it is (r_R, r_p, r_v, r_β).
 """
 
 import math
@@ -15,50 +17,109 @@ import numpy as np
 
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.model.composed import FIRST, INNER, SCRATCH, SECOND, carry_over, put_sensor
+from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.imu_noise import SIZE
 from factorbus.solver.kernels.model.preintegration import (
+    ROOM_T,
     Preintegrated,
+    correct_to_first_order,
     fill_rotation,
     fill_series,
-    nothing_yet,
+    make_room,
     preintegrate,
+    preintegrated_in,
 )
-from factorbus.solver.kernels.model.se3 import quat_product
+from factorbus.solver.kernels.model.se3 import compose_inverse_se3, quat_product
 
 POSE_A, VELOCITY_A, BIAS_A, POSE_B, VELOCITY_B, BIAS_B = range(6)
-# Columns of the Jacobians: pose (translation, rotation), velocity, bias, of a and of b.
-_B = 15
+# Columns of the Jacobians: pose (translation, rotation), velocity, bias, of a and of b; then of the mount, of gravity.
+_B, _FURTHER = 15, 30
 _T, _R, _V, _G = 0, 3, 6, 9
 _SMALL = 1e-4
 
 
 @part
-def imu(x: F64, places: I64, samples: int, z: F64, r: F64, J: F64) -> None:
-    """r (15,) and J (15, 30), whitened.
+def imu(x: F64, places: I64, form: ImuLayout, z: F64, kept: F64, r: F64, J: F64) -> None:
+    """r (15,) and J (15, Σ d).
 
-    places (6,): where the values of the variables begin in x; z: the measurement, W behind it.
+    places: where the values of the variables begin in x; z: the measurement, and of samples W behind it.
+    kept (ROOM,): samples that are integrated at the bias already are not again, else they are kept there; () nowhere.
     """
-    a, b = places[POSE_A], places[BIAS_A]
-    delta = nothing_yet()
-    T = preintegrate(samples, z, x[b : b + 6], delta, True)
-    R = np.empty((3, 3))
-    fill_rotation(x, a + 3, R)
+    bias, room = x[places[BIAS_A] : places[BIAS_A] + of.BIAS], kept if kept.size > 0 else make_room()
+    y = np.empty(SCRATCH)
+    put_delta(form, z, bias, room, True)
+    delta, T, g = preintegrated_in(room), room[ROOM_T], gravity_of(form, x, places, z)
+    is_mounted = put_mount(form, x, places, z, y)
+    put_sensor(is_mounted, False, x, places[POSE_A], y, FIRST)
+    put_sensor(is_mounted, False, x, places[POSE_B], y, SECOND)
     J[:, :] = 0.0
-    _rotation(x, a + 3, places[POSE_B] + 3, delta, r, J)
-    _translations(x, places, T, z, R, delta, r, J)
-    _walk(x, b, places[BIAS_B], T, z, r, J)
-    _whiten(z, of.SAMPLES + of.SAMPLE * samples, r, J)
+    _rotation(y, FIRST + 3, SECOND + 3, delta, r, J)
+    _translations(x, places, y, T, g, delta, r, J)
+    if form.gravity >= 0:
+        _gravity(T, y, _FURTHER if form.mount < 0 else _FURTHER + 6, J)
+    if is_mounted:
+        _carry_over_mount(form.mount >= 0, y, J)
+    if form.samples == 0:
+        _drift(x, places[BIAS_A], places[BIAS_B], r, J)
+    else:
+        _walk(x, places[BIAS_A], places[BIAS_B], T, z, r, J)
+        _whiten(z, form.start + of.SAMPLE * form.samples, r, J)
+
+
+@inline_kernel
+def put_delta(form: ImuLayout, z: F64, bias: F64, room: F64, jacobians: bool) -> None:
+    """Δ at a bias to `room`."""
+    if form.samples == 0:
+        correct_to_first_order(form, z, bias, room)
+    else:
+        preintegrate(form, z, bias, room, jacobians)
+
+
+@inline_kernel
+def gravity_of(form: ImuLayout, x: F64, places: I64, z: F64) -> F64:
+    """g (3,)."""
+    return z[form.gravity_at : form.gravity_at + 3] if form.gravity < 0 else x[places[form.gravity] :][:3]
+
+
+@inline_kernel
+def put_mount(form: ImuLayout, x: F64, places: I64, z: F64, y: F64) -> bool:
+    """m to y[INNER]; False: the IMU is where the pose is."""
+    if form.mount >= 0:
+        y[INNER : INNER + of.MOUNT] = x[places[form.mount] : places[form.mount] + of.MOUNT]
+        return True
+    y[INNER : INNER + of.MOUNT] = z[form.mount_at : form.mount_at + of.MOUNT]
+    is_mounted = y[INNER + 6] != 1.0
+    for c in range(6):
+        is_mounted |= y[INNER + c] != 0.0
+    return is_mounted
 
 
 @part
-def _rotation(x: F64, a: int, b: int, delta: Preintegrated, r: F64, J: F64) -> None:
-    """Rows of r_R; quaternions at x[a] and x[b].
+def _carry_over_mount(is_variable: bool, y: F64, J: F64) -> None:
+    """The columns of both poses, from those of the IMU's to the robot's, as in (3.35); and those of the mount."""
+    B = np.empty((SIZE, 6))
+    for a in range(SIZE):
+        for c in range(6):
+            B[a, c] = J[a, _B + c]
+            if is_variable:
+                J[a, _FURTHER + c] = J[a, c] + B[a, c]
+    carry_over(True, SIZE, False, y, INNER, B, J, _B)
+    for a in range(SIZE):
+        for c in range(6):
+            B[a, c] = J[a, c]
+    carry_over(True, SIZE, False, y, INNER, B, J, 0)
+
+
+@part
+def _rotation(y: F64, a: int, b: int, delta: Preintegrated, r: F64, J: F64) -> None:
+    """Rows of r_R; quaternions at y[a] and y[b].
 
     ∂r_R/∂θₐ = −Jr⁻¹(r_R) R_bᵀ Rₐ,   ∂r_R/∂θ_b = Jr⁻¹(r_R),   ∂r_R/∂β_g = −Jr⁻¹(r_R) Eᵀ ∂ΔR/∂β_g,  E = ΔRᵀ Rₐᵀ R_b
     """
     q, e, C, K = delta.q, np.empty(4), np.empty((3, 3)), np.empty((3, 3))
     # Rₐᵀ R_b, then E.
-    rx, ry, rz, rw = quat_product(-x[a], -x[a + 1], -x[a + 2], x[a + 3], x[b], x[b + 1], x[b + 2], x[b + 3])
+    rx, ry, rz, rw = quat_product(-y[a], -y[a + 1], -y[a + 2], y[a + 3], y[b], y[b + 1], y[b + 2], y[b + 3])
     e[0], e[1], e[2], e[3] = rx, ry, rz, rw
     fill_rotation(e, 0, C)
     e[0], e[1], e[2], e[3] = quat_product(-q[0], -q[1], -q[2], q[3], rx, ry, rz, rw)
@@ -93,17 +154,17 @@ def log_and_slope(e: F64, r: F64, K: F64) -> None:
 
 
 @part
-def _translations(x: F64, places: I64, T: float, z: F64, R: F64, delta: Preintegrated, r: F64, J: F64) -> None:
-    """Rows of r_p and r_v, R (3, 3) the rotation of a."""
-    a, b, v, w = places[POSE_A], places[POSE_B], places[VELOCITY_A], places[VELOCITY_B]
-    gap, rush, C = np.empty(3), np.empty(3), np.empty((3, 3))
-    fill_rotation(x, b + 3, C)
+def _translations(x: F64, places: I64, y: F64, T: float, g: F64, delta: Preintegrated, r: F64, J: F64) -> None:
+    """Rows of r_p and r_v."""
+    v, w = places[VELOCITY_A], places[VELOCITY_B]
+    gap, rush, R, C = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    fill_rotation(y, FIRST + 3, R)
+    fill_rotation(y, SECOND + 3, C)
     for i in range(3):
         gap[i] = rush[i] = 0.0
         for m in range(3):
-            g = z[of.GRAVITY + m]
-            gap[i] += R[m, i] * (x[b + m] - x[a + m] - T * (x[v + m] + 0.5 * T * g))
-            rush[i] += R[m, i] * (x[w + m] - x[v + m] - T * g)
+            gap[i] += R[m, i] * (y[SECOND + m] - y[FIRST + m] - T * (x[v + m] + 0.5 * T * g[m]))
+            rush[i] += R[m, i] * (x[w + m] - x[v + m] - T * g[m])
         r[3 + i], r[6 + i] = gap[i] - delta.p[i], rush[i] - delta.v[i]
     _cross(gap, J, 3)
     _cross(rush, J, 6)
@@ -122,6 +183,24 @@ def _cross(u: F64, J: F64, row: int) -> None:
     """⌊u⌋ into the columns of a's rotation."""
     J[row, _R + 1], J[row, _R + 2], J[row + 1, _R + 2] = -u[2], u[1], -u[0]
     J[row + 1, _R], J[row + 2, _R], J[row + 2, _R + 1] = u[2], -u[1], u[0]
+
+
+@inline_kernel
+def _gravity(T: float, y: F64, column: int, J: F64) -> None:
+    """∂r_p/∂g = −½ T² Rₐᵀ,  ∂r_v/∂g = −T Rₐᵀ."""
+    R = np.empty((3, 3))
+    fill_rotation(y, FIRST + 3, R)
+    for i in range(3):
+        for c in range(3):
+            J[3 + i, column + c], J[6 + i, column + c] = -0.5 * T * T * R[c, i], -T * R[c, i]
+
+
+@inline_kernel
+def _drift(x: F64, a: int, b: int, r: F64, J: F64) -> None:
+    """Rows of r_β."""
+    for c in range(of.BIAS):
+        r[9 + c] = x[b + c] - x[a + c]
+        J[9 + c, _G + c], J[9 + c, _B + _G + c] = -1.0, 1.0
 
 
 @inline_kernel
@@ -149,25 +228,31 @@ def _whiten(z: F64, w: int, r: F64, J: F64) -> None:
 
 
 @part
-def place_by_imu(end: int, x: F64, places: I64, samples: int, z: F64) -> None:
+def place_by_imu(end: int, x: F64, places: I64, form: ImuLayout, z: F64) -> None:
     """Give the pose, the velocity or the bias of b (`end`: which) what follows from those of a: a residual of zero."""
-    a, v, b, out = places[POSE_A], places[VELOCITY_A], places[BIAS_A], places[end]
+    v, b, out = places[VELOCITY_A], places[BIAS_A], places[end]
     if end == BIAS_B:
-        for c in range(6):
+        for c in range(of.BIAS):
             x[out + c] = x[b + c]
         return
-    delta = nothing_yet()
-    T = preintegrate(samples, z, x[b : b + 6], delta, False)
-    q, R = delta.q, np.empty((3, 3))
-    fill_rotation(x, a + 3, R)
+    y, R, room, g = np.empty(SCRATCH), np.empty((3, 3)), make_room(), gravity_of(form, x, places, z)
+    put_delta(form, z, x[b : b + of.BIAS], room, False)
+    (q, p, rise, _, _, _), T = preintegrated_in(room), room[ROOM_T]
+    is_mounted = put_mount(form, x, places, z, y)
+    put_sensor(is_mounted, False, x, places[POSE_A], y, FIRST)
+    fill_rotation(y, FIRST + 3, R)
     for i in range(3):
-        g = z[of.GRAVITY + i]
-        if end == POSE_B:
-            turned = R[i, 0] * delta.p[0] + R[i, 1] * delta.p[1] + R[i, 2] * delta.p[2]
-            x[out + i] = x[a + i] + T * (x[v + i] + 0.5 * T * g) + turned
-        else:
-            x[out + i] = x[v + i] + T * g + R[i, 0] * delta.v[0] + R[i, 1] * delta.v[1] + R[i, 2] * delta.v[2]
-    if end == POSE_B:
-        x[out + 3], x[out + 4], x[out + 5], x[out + 6] = quat_product(
-            x[a + 3], x[a + 4], x[a + 5], x[a + 6], q[0], q[1], q[2], q[3]
-        )
+        if end == VELOCITY_B:
+            x[out + i] = x[v + i] + T * g[i] + R[i, 0] * rise[0] + R[i, 1] * rise[1] + R[i, 2] * rise[2]
+        turned = R[i, 0] * p[0] + R[i, 1] * p[1] + R[i, 2] * p[2]
+        y[SECOND + i] = y[FIRST + i] + T * (x[v + i] + 0.5 * T * g[i]) + turned
+    if end == VELOCITY_B:
+        return
+    a = FIRST + 3
+    y[SECOND + 3], y[SECOND + 4], y[SECOND + 5], y[SECOND + 6] = quat_product(
+        y[a], y[a + 1], y[a + 2], y[a + 3], q[0], q[1], q[2], q[3]
+    )
+    if is_mounted:
+        compose_inverse_se3(y, SECOND, y, INNER, SECOND)
+    for c in range(of.MOUNT):
+        x[out + c] = y[SECOND + c]

@@ -12,7 +12,14 @@ import numpy as np
 
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
-from factorbus.solver.kernels.model.preintegration import SampleTerms, add_sample, nothing_yet, scratch_of_sample
+from factorbus.solver.kernels.model.imu_layout import ImuLayout
+from factorbus.solver.kernels.model.preintegration import (
+    SampleTerms,
+    add_sample,
+    make_room,
+    preintegrated_in,
+    scratch_of_sample,
+)
 
 SIZE = 9  # numbers of Δ
 # A pivot below this share of its diagonal entry is rounding: Σ is singular.
@@ -20,10 +27,10 @@ _PIVOT_TOLERANCE = 1e-14
 
 
 @part
-def write_root(samples: int, z: F64, k: int, out: F64) -> bool:
+def write_root(form: ImuLayout, z: F64, k: int, out: F64) -> bool:
     """W lower triangular, row by row, to out[k:], with WᵀW = Σ⁻¹ of the measurement that begins at z[0]; False: Σ is
     singular, as of a single sample without noise of integration."""
-    L = propagate_noise(samples, z)
+    L = propagate_noise(form, z)
     if not _factorize(L):
         return False
     # W = L⁻¹, column by column.
@@ -43,13 +50,14 @@ def write_root(samples: int, z: F64, k: int, out: F64) -> bool:
 
 
 @part
-def propagate_noise(samples: int, z: F64) -> F64:
+def propagate_noise(form: ImuLayout, z: F64) -> F64:
     """Σ (9, 9) of Δ, at the bias that the measurement names.  (3.46)"""
-    delta, sample, S = nothing_yet(), scratch_of_sample(), np.zeros((SIZE, SIZE))
-    M, bias = np.empty((4, 3, 3)), z[of.BIAS : of.BIAS + 6]
+    delta, sample, S = preintegrated_in(make_room()), scratch_of_sample(), np.zeros((SIZE, SIZE))
+    M, bias = np.empty((4, 3, 3)), z[form.bias_at : form.bias_at + of.BIAS]
+    delta.q[3] = 1.0
     gyroscope, accelerometer, integration = z[of.GYROSCOPE], z[of.ACCELEROMETER], z[of.INTEGRATION]
-    for n in range(samples):
-        k = of.SAMPLES + of.SAMPLE * n
+    for n in range(form.samples):
+        k = form.start + of.SAMPLE * n
         add_sample(z, k, bias, delta, sample, True)
         h, Jr = z[k], sample.Jr
         _carry(h, sample, S, M)

@@ -32,7 +32,7 @@ from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
 from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
 from factorbus.solver.kernels.model.sizes import MOST_ENDS
-from factorbus.solver.kernels.model.velocity import velocity_frame_se2, velocity_frame_se3
+from factorbus.solver.kernels.model.velocity import length_vector3, velocity_frame_se2, velocity_frame_se3
 from factorbus.solver.lenses.layout import GOOD
 
 _MOST = 6  # numbers of a residual and of a tangent: the size of the scratch that kernels have for a factor
@@ -104,6 +104,7 @@ FACTOR_MODELS = {
     "range_between_se3": FactorModel(range_between_se3, "MATH (3.34)", rigid=True, positive_at=0),
     "velocity_frame_se2": FactorModel(velocity_frame_se2, "MATH (3.42)"),
     "velocity_frame_se3": FactorModel(velocity_frame_se3, "MATH (3.42)"),
+    "length_vector3": FactorModel(length_vector3, "MATH (3.62)", positive_at=0),
     "bearing_se2": FactorModel(bearing_se2, "MATH (3.24)", rigid=True),
     "bearing_se3": FactorModel(bearing_se3, "MATH (3.25)", rigid=True, directions=(0,)),
 }
@@ -153,13 +154,15 @@ def check_kinds() -> None:
 
 check_kinds()
 # The last are in place of a kind's for linear factors, for members of a factor of more than two variables, which are
-# not looked at alone, for clients' own kinds, and for inertial factors.  `many` evaluates all of these but members.
+# not looked at alone, for clients' own kinds, and for inertial ones, with samples and integrated already.  `many`
+# evaluates all of these but members.
 _MODELS = (
     *(FACTOR_MODELS[name] for name in FACTOR_KINDS),
     FactorModel(prior_point2, "MATH (3.26)"),
     FactorModel(prior_point2, "", bounded=True),
     FactorModel(prior_point2, "MATH §3.11"),
     FactorModel(prior_point2, "MATH (3.48)"),
+    FactorModel(prior_point2, "MATH (3.60)"),
 )
 
 
@@ -183,7 +186,7 @@ _DIRECTIONS = _starts(model.directions for model in _MODELS)
 CAMERA = _LENS_AT >= 0
 BOUNDED = np.array([model.bounded for model in _MODELS])
 # Whether it is a family of kinds, whose variables and sizes are each factor's own: linear, own, inertial.
-OF_FAMILY = np.isin(np.arange(len(_MODELS)), (at.LINEAR, at.OWN, at.IMU))
+OF_FAMILY = np.isin(np.arange(len(_MODELS)), (at.LINEAR, at.OWN, at.IMU, at.PREINTEGRATED))
 # By the code of a kind of variables.
 POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])
 VECTOR = np.array([kind.is_vector for kind in VARIABLE_KINDS.values()])

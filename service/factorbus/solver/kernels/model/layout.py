@@ -28,10 +28,11 @@ F_WIDTH = 8
 # Bits of F_FLAGS.
 SWAPPED = 1  # the block of the pair stands as (j, i), because column j comes first
 RIGID = 2  # of an own kind: its residual stays as its two variables move as one body
+MOUNTED = 4  # of an inertial factor: the mount is a variable, the first behind the six that all of them have
 LOSS_SHIFT, LOSS_MASK = 8, 0xFF  # the code of its loss
 OFFSET_SHIFT, OFFSET_MASK = 16, 0xFFFF  # of a member: how many rows before it the factor begins
 ENDS_SHIFT, ENDS_MASK = 32, 0xFF  # of a factor of any number of variables (`many`): how many; of others 0
-SAMPLES_SHIFT, SAMPLES_MASK = 40, 0x7FF  # of an inertial factor: how many samples it has
+SAMPLES_SHIFT, SAMPLES_MASK = 40, 0x7FF  # of an inertial factor: how many samples; 0: none
 DIM_SHIFT = 51  # of a factor that `many` evaluates: how many numbers its residual has
 
 # Entries of `counts`.
@@ -63,10 +64,11 @@ LINEAR = len(FACTOR_KINDS)
 MEMBER = LINEAR + 1
 # The kind of all factors of kinds that clients wrote themselves (`expression_layout`).
 OWN = MEMBER + 1
-# The kind of all inertial factors, whose number of samples is their own.
+# The kind of all inertial factors with samples, whose number is their own, and that of those integrated already.
 IMU = OWN + 1
+PREINTEGRATED = IMU + 1
 # How many codes there are behind those of the wire's table.
-FURTHER_CODES = IMU + 1 - LINEAR
+FURTHER_CODES = PREINTEGRATED + 1 - LINEAR
 
 PRIOR_SE2 = FACTOR_CODES["prior_se2"]
 PRIOR_SE3 = FACTOR_CODES["prior_se3"]

@@ -18,10 +18,10 @@ from factorbus.solver.kernels.model.expressions import BEHIND, chi2_of_own, eval
 from factorbus.solver.kernels.model.factor_rows import (
     count_ends,
     end_of,
+    form_of_imu,
     information_start,
     loss_code,
     residual_size,
-    sample_count,
 )
 from factorbus.solver.kernels.model.imu import imu
 from factorbus.solver.kernels.model.linear import linear
@@ -39,10 +39,16 @@ class Many(NamedTuple):
     start: I64
 
 
-@shared_kernel(types.int64, _ROWS, _ROWS, _FLOATS, _FLOATS)
+@inline_kernel
 def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
     """The factor that begins at row f at the values x, whitened and with its loss; what χ² has beside rᵀ r."""
-    more, many = evaluate_plain(f, var, fac, x, payload)
+    return linearize_kept(f, var, fac, x, payload, payload[:0])
+
+
+@shared_kernel(types.int64, _ROWS, _ROWS, _FLOATS, _FLOATS, _FLOATS)
+def linearize_kept(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) -> tuple[float, Many]:
+    """The same, of an inertial factor by what is in `kept`, see `imu`."""
+    more, many = evaluate_plain(f, var, fac, x, payload, kept)
     dim, start = len(many.J), information_start(f, var, fac, payload)
     whiten_in_place(dim, start, payload, many)
     loss = loss_code(f, fac)
@@ -52,7 +58,7 @@ def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
 
 
 @part
-def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
+def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) -> tuple[float, Many]:
     """Residual and Jacobians of the factor that begins at row f; what χ² has beside rᵀ Ω r."""
     kind, ends, dim, more = fac[f, at.F_KIND], count_ends(f, fac), residual_size(f, fac), 0.0
     numbers = np.empty(3 * ends + 1, np.int64)
@@ -69,8 +75,8 @@ def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[fl
     many = Many(np.zeros(max(dim, at.R_SIZE)), np.zeros((dim, start[ends])), start)
     if kind == at.LINEAR:
         linear(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
-    elif kind == at.IMU:
-        imu(x, places, sample_count(f, fac), payload[fac[f, at.F_AT] :], many.r, many.J)
+    elif kind == at.IMU or kind == at.PREINTEGRATED:
+        imu(x, places, form_of_imu(f, fac), payload[fac[f, at.F_AT] :], kept, many.r, many.J)
     else:
         more = composed(kind, x, places, payload, fac[f, at.F_AT], many.r, many.J, start)
     return more, many
@@ -162,9 +168,9 @@ def soften_many(loss: int, scale: float, more: float, many: Many) -> float:
 
 
 @part
-def chi2_of_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> float:
-    """χ² of the factor that begins at row f."""
+def chi2_of_many(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) -> float:
+    """χ² of the factor that begins at row f; kept: as for `linearize_kept`."""
     if fac[f, at.F_KIND] == at.OWN:
         return chi2_of_own(f, var, fac, x, payload)
-    more, many = linearize_many(f, var, fac, x, payload)
+    more, many = linearize_kept(f, var, fac, x, payload, kept)
     return more + square_of(many)

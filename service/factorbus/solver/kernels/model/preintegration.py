@@ -15,6 +15,7 @@ import numpy as np
 
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
+from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix
 
 _SMALL = (
@@ -46,12 +47,29 @@ class SampleTerms(NamedTuple):
     Jr: F64
 
 
+# Δ in an array: the bias it was integrated at, T, and what `Preintegrated` has, each row by row.
+ROOM_T = of.BIAS
+ROOM = of.BIAS + of.DELTA
+
+
 @inline_kernel
-def nothing_yet() -> Preintegrated:
-    """Of no samples."""
-    q = np.zeros(4)
-    q[3] = 1.0
-    return Preintegrated(q, np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 6)), np.zeros((3, 6)))
+def make_room() -> F64:
+    """Room for Δ, (ROOM,): of no samples."""
+    return np.zeros(ROOM)
+
+
+@inline_kernel
+def preintegrated_in(room: F64) -> Preintegrated:
+    """Δ in an array, or where one begins."""
+    k = ROOM_T + 1
+    return Preintegrated(
+        room[k : k + 4],
+        room[k + 4 : k + 7],
+        room[k + 7 : k + 10],
+        room[k + 10 : k + 19].reshape(3, 3),
+        room[k + 19 : k + 37].reshape(3, 6),
+        room[k + 37 : k + 55].reshape(3, 6),
+    )
 
 
 @inline_kernel
@@ -61,16 +79,59 @@ def scratch_of_sample() -> SampleTerms:
 
 
 @part
-def preintegrate(samples: int, z: F64, bias: F64, delta: Preintegrated, jacobians: bool) -> float:
-    """All samples of the measurement that begins at z[0], at a bias (6,); gives T, their durations together, seconds.
+def preintegrate(form: ImuLayout, z: F64, bias: F64, room: F64, jacobians: bool) -> None:
+    """All samples of the measurement that begins at z[0], at a bias (6,), into `room`.
 
-    delta: of no samples, `nothing_yet`.  Without `jacobians` R_b, p_b and v_b are left as they are.
+    Where that has them at a bias of the same bits already, they are not looked at.  Without `jacobians` it has to be
+    new, and R_b, p_b and v_b stay zero.
     """
-    scratch, total = scratch_of_sample(), 0.0
-    for n in range(samples):
-        add_sample(z, of.SAMPLES + of.SAMPLE * n, bias, delta, scratch, jacobians)
-        total += z[of.SAMPLES + of.SAMPLE * n]
-    return total
+    if has_bits_of(bias, room):
+        return
+    room[:] = 0.0
+    delta, scratch, total = preintegrated_in(room), scratch_of_sample(), 0.0
+    delta.q[3] = 1.0
+    for n in range(form.samples):
+        add_sample(z, form.start + of.SAMPLE * n, bias, delta, scratch, jacobians)
+        total += z[form.start + of.SAMPLE * n]
+    room[: of.BIAS], room[ROOM_T] = bias, total
+
+
+@inline_kernel
+def has_bits_of(bias: F64, room: F64) -> bool:
+    """Whether `room` has samples, integrated at this bias to the bit."""
+    same, here, there = room[ROOM_T] > 0.0, bias.view(np.int64), room.view(np.int64)
+    for c in range(of.BIAS):
+        same &= here[c] == there[c]
+    return same
+
+
+@part
+def correct_to_first_order(form: ImuLayout, z: F64, bias: F64, room: F64) -> None:
+    """Δ of a measurement that is integrated already, which begins at z[0], at a bias (6,).  (3.60)
+
+    ΔR := ΔR exp(J_R δ_g),  J_R := Jr(J_R δ_g) J_R,  Δp += J_p δ,  Δv += J_v δ,  δ the bias less that of the measurement
+    """
+    room[: of.BIAS] = bias
+    room[of.BIAS :] = z[form.start : form.start + of.DELTA]
+    q, p, v, R_b, p_b, v_b = preintegrated_in(room)
+    turn, Jr, k = np.zeros(3), np.empty((3, 3)), form.bias_at
+    for a in range(3):
+        for c in range(of.BIAS):
+            step = bias[c] - z[k + c]
+            if c < 3:
+                turn[a] += R_b[a, c] * step
+            p[a] += p_b[a, c] * step
+            v[a] += v_b[a, c] * step
+    x, y, w = turn[0], turn[1], turn[2]
+    square = x * x + y * y + w * w
+    half, ew = half_turn(square)
+    q[0], q[1], q[2], q[3] = quat_product(q[0], q[1], q[2], q[3], half * x, half * y, half * w, ew)
+    _, b, c2 = series_of(square)
+    fill_series(-b, c2, x, y, w, Jr)
+    for c in range(3):
+        b0, b1, b2 = R_b[0, c], R_b[1, c], R_b[2, c]
+        for a in range(3):
+            R_b[a, c] = Jr[a, 0] * b0 + Jr[a, 1] * b1 + Jr[a, 2] * b2
 
 
 @inline_kernel
@@ -123,7 +184,14 @@ def _describe(ax: float, ay: float, az: float, x: float, y: float, z: float, sam
         RA[i, 0] = R[i, 1] * az - R[i, 2] * ay
         RA[i, 1] = R[i, 2] * ax - R[i, 0] * az
         RA[i, 2] = R[i, 0] * ay - R[i, 1] * ax
-    q = x * x + y * y + z * z
+    a, b, c = series_of(x * x + y * y + z * z)
+    fill_series(a, b, x, y, z, sample.E)
+    fill_series(-b, c, x, y, z, sample.Jr)
+
+
+@inline_kernel
+def series_of(q: float) -> tuple:
+    """(sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³) of θ²."""
     if q < _SMALL:
         a = 1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q * (1 / 39916800)))))
         b = 0.5 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q * (1 / 479001600)))))
@@ -132,8 +200,7 @@ def _describe(ax: float, ay: float, az: float, x: float, y: float, z: float, sam
         angle = math.sqrt(q)
         a, sine = math.sin(angle) / angle, math.sin(0.5 * angle)
         b, c = 2.0 * sine * sine / q, (1.0 - a) / q
-    fill_series(a, b, x, y, z, sample.E)
-    fill_series(-b, c, x, y, z, sample.Jr)
+    return a, b, c
 
 
 @inline_kernel

@@ -1,4 +1,5 @@
-"""Velocities along the axes of the map, measured in a frame whose pose is a variable: of a GNSS receiver.  MATH §3.9.
+"""Vectors along the axes of the map: velocities measured in a frame whose pose is a variable, as by a GNSS receiver,
+MATH §3.9, and the length of one, as of gravity, MATH §3.10.
 
 Arguments as in `se2`.
 """
@@ -31,3 +32,12 @@ def velocity_frame_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B
         A[a, 0], A[a, 1], A[a, 2] = 0.0, 0.0, 0.0
         A[a, 3], A[a, 4], A[a, 5] = q2 * v1 - q1 * v2, q0 * v2 - q2 * v0, q1 * v0 - q0 * v1
         B[a, 0], B[a, 1], B[a, 2] = q0, q1, q2
+
+
+@inline_kernel
+def length_vector3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) -> None:
+    """r = |x| − z,  A = xᵀ/|x|, of no length 0.  (3.62)"""
+    length = math.sqrt(x[i] * x[i] + x[i + 1] * x[i + 1] + x[i + 2] * x[i + 2])
+    r[0], scale = length - p[k], 1.0 / length if length > 0.0 else 0.0
+    for c in range(3):
+        A[0, c] = scale * x[i + c]
