@@ -1,98 +1,35 @@
 """Range-aided data sets of GTSAM's wheel: the optimum is GTSAM's, and every step of a replay is at its batch optimum.
 
-goats_15 and goats_16 are .pyfg files: an underwater robot and acoustic beacons.  Plaza1 and Plaza2 (a lawn mower and
-radio beacons; Djugash, Hamner and Roth, 2009) are tables, of which the first poses are written as .pyfg here.
-
-The wheel's BetweenFactorPose2 measures its error by the logarithm, ours is that of g2o (MATH (3.2)): another
-objective, 2.8e-6 apart at the optimum of goats_16.  So GTSAM gets relative poses as a factor with our residual, and its
-own ranges.
+Here beacons enter at the file's own places; `ranges` drives the same sets as a front end would that knows none of them.
 """
 
-from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
-import gtsam
 import numpy as np
 import pytest
 from bench.every.judge import Judge
-from bench.replays.columns import symmetric
-from bench.replays.gtsam_factors import gtsam_factors
+from bench.range_drives import DATA, GOATS, PLAZA, file_of, trilaterated
+from bench.range_solvers import gtsam_optimum
+from bench.ranges import driven, missed
 
 from factorbus.formats import read
-from factorbus.proto.messages import Batch, Factors
 from factorbus.solver import Options, Solver, solve_batch
 
-DATA = Path(gtsam.__file__).parent / "Data"
-GOATS = ("goats_15.pyfg", "goats_16.pyfg")
-PLAZA = ("Plaza1_.mat", "Plaza2_.mat")
 STEPS = 500
 WORST = 1.002
 
 
-def file_of(name: str, folder: Path) -> Path:
-    """The data set as a .pyfg."""
+def written(name: str, folder: Path) -> Path:
+    """The data set as a .pyfg, of tables the first poses."""
     if not (DATA / name).exists():
         pytest.skip(f"this wheel of GTSAM has no {name} in {DATA}")
-    return plaza(DATA / name, folder / f"{name}.pyfg") if name in PLAZA else DATA / name
-
-
-def plaza(table: Path, path: Path) -> Path:
-    """The first poses of a Plaza data set: odometry, and each range from the pose at or before its time."""
-    tables = pytest.importorskip("scipy.io").loadmat(str(table))
-    odometry, ways, far, beacons = tables["DRp"][:STEPS], tables["DR"], tables["TD"], tables["TL"]
-    time = odometry[:, 0]
-    lines = [f"VERTEX_SE2 {t:.6f} A{k} {x} {y} {h}" for k, (t, x, y, h) in enumerate(odometry.tolist())]
-    lines += [f"VERTEX_XY L{int(name)} {x} {y}" for name, x, y in beacons.tolist()]
-    for k, (_, way, turn) in enumerate(ways[: STEPS - 1].tolist()):
-        lines.append(f"EDGE_SE2 {time[k]:.6f} A{k} A{k + 1} {way} 0 {turn} 0.0025 0 0 0.0025 0 0.0001")
-    for t, _, name, z in far[far[:, 0] < time[-1]].tolist():
-        pose = max(int(np.searchsorted(time, t, "right")) - 1, 0)
-        lines.append(f"EDGE_RANGE {time[pose]:.6f} A{pose} L{int(name)} {z} 1")
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def gtsam_optimum(batch: Batch, estimate: Any) -> float:
-    """χ² at the end of GTSAM's Levenberg-Marquardt from `estimate`."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for group in estimate:
-        for key, row in zip(group.keys.tolist(), group.values, strict=True):
-            values.insert(key, gtsam.Pose2(*row.tolist()) if group.kind == "se2" else row.copy())
-    for group in batch.factors:
-        for factor in relative_poses(group) if group.kind == "between_se2" else gtsam_factors(group):
-            graph.add(factor)
-    for key in (key for group in batch.variables if group.fixed for key in group.keys.tolist()):
-        graph.add(gtsam.NonlinearEqualityPose2(key, values.atPose2(key)))
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-13)
-    params.setAbsoluteErrorTol(1e-13)
-    params.setMaxIterations(200)
-    return 2 * graph.error(gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize())
-
-
-def relative_poses(group: Factors) -> Iterator[Any]:
-    """As GTSAM's factors with the residual (3.2): E = z⁻¹ a⁻¹ b as (x, y, θ)."""
-    rows = zip(group.keys.tolist(), group.measured, symmetric(group.information), strict=True)
-    for keys, z, information in rows:
-        measured = gtsam.Pose2(*z.tolist())
-
-        def error(_: Any, values: Any, jacobians: Any, ends: list[int] = keys, measured: Any = measured) -> np.ndarray:
-            relative = values.atPose2(ends[0]).between(values.atPose2(ends[1]))
-            E = measured.between(relative)
-            if jacobians is not None:
-                B = np.eye(3)
-                B[:2, :2] = E.rotation().matrix()
-                jacobians[0], jacobians[1] = -B @ relative.inverse().AdjointMap(), B
-            return np.array([E.x(), E.y(), E.theta()])
-
-        yield gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Information(information), keys, error)
+    return file_of(name, folder, STEPS)
 
 
 @pytest.mark.parametrize("name", [*GOATS, *PLAZA])
 def test_the_optimum_is_that_of_gtsam_s_levenberg_marquardt(tmp_path: Path, name: str) -> None:
-    graph = read(file_of(name, tmp_path), strict=True)
+    graph = read(written(name, tmp_path), strict=True)
     whole = graph.whole()
     ours = solve_batch(whole.variables, whole.factors)
     assert ours.converged
@@ -101,7 +38,7 @@ def test_the_optimum_is_that_of_gtsam_s_levenberg_marquardt(tmp_path: Path, name
 
 @pytest.mark.parametrize("name", [*GOATS, *PLAZA])
 def test_every_step_of_a_replay_is_at_its_batch_optimum(tmp_path: Path, name: str) -> None:
-    graph = read(file_of(name, tmp_path), strict=True)
+    graph = read(written(name, tmp_path), strict=True)
     solver, judge = Solver(Options()), Judge()
     converged = 0
     for batch in islice(graph.steps(), STEPS):
@@ -114,3 +51,41 @@ def test_every_step_of_a_replay_is_at_its_batch_optimum(tmp_path: Path, name: st
     assert converged > 0.5 * min(STEPS, graph.poses)
     points = {key for group in solver.estimate() if group.kind == "point2" for key in group.keys.tolist()}
     assert len(points) == graph.landmarks, "every beacon has entered"
+
+
+def test_a_drive_that_knows_no_beacon_finds_all_of_them_and_ends_at_gtsam_s_optimum() -> None:
+    ours, theirs = driven("goats_16", None, 100)
+    assert ours["chi2_ratio"] <= WORST
+    assert ours["unconverged"] == 0
+    assert ours["judged"] == ours["steps"] == theirs["steps"]
+    assert abs(ours["optimum_off"]) <= 1e-6
+    assert len(ours["entered"]) == 4
+    assert not ours["waiting"]
+    assert ours["beacon_m"] < 12
+    assert abs(ours["beacon_m"] - theirs["beacon_m"]) < 0.01
+
+
+def test_a_beacon_waits_while_its_ranges_leave_two_places() -> None:
+    rng, beacon, sigma = np.random.default_rng(4), np.array([3.0, 12.0]), 0.2
+    straight = np.column_stack([np.linspace(0, 10, 20), np.zeros(20)])
+    around = np.vstack([straight, np.column_stack([np.full(20, 10.0), np.linspace(0, 8, 20)])])
+    for at, is_known in ((straight, False), (around, True)):
+        z = np.linalg.norm(at - beacon, axis=1) + rng.normal(0, sigma, len(at))
+        place, clear = trilaterated(at, z, np.full(len(at), sigma**-2))
+        assert (place is not None) == is_known, clear
+    assert place is not None
+    assert np.linalg.norm(place - beacon) < 0.5
+
+
+def test_a_near_straight_way_by_far_beacon_is_not_enough() -> None:
+    at = np.column_stack([np.linspace(0, 1, 30), np.linspace(0, 0.01, 30)])
+    z = np.linalg.norm(at - (60.0, 80.0), axis=1)
+    assert trilaterated(at, z, np.ones(30))[0] is None
+
+
+def test_what_is_missed_is_said() -> None:
+    row = {"dataset": "d", "solver": "factorbus", "cpu_s": 0.5, "chi2_ratio": 1.0, "optimum_off": 0.0}
+    peer = row | {"solver": "isam2", "cpu_s": 1.0}
+    assert missed([row, peer]) == []
+    bad = row | {"cpu_s": 1.1, "chi2_ratio": 1.01, "optimum_off": 1e-5}
+    assert [each.split(":")[0] for each in missed([bad, peer])] == ["d"] * 3

@@ -13,7 +13,7 @@ from factorbus.cli.process.options import json_option
 
 BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
 LONG = ("every-step", "paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
-ASKED = ("ask", "digest", "calibration", "inertial", "own")  # a minute or two; on request
+ASKED = ("ask", "digest", "calibration", "inertial", "own", "ranges")  # a minute or two; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -48,6 +48,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
                units of its covariance; --seeds, --only
     inertial   drives with an IMU and GNSS that ship in the gtsam wheel, online, beside iSAM2 with the same factors;
                --only, --every
+    ranges     range-only drives that ship in the gtsam wheel, online, beside iSAM2 with the same factors: χ² of
+               every step over its batch optimum, and GTSAM's optimum; --only, --every, --steps
     own        a kind of factor written as a formula beside the built-in one, and a Python factor in GTSAM: time of a
                step; --only, --poses
     all        cholesky, bus, idp, ros2 and journal: some minutes
