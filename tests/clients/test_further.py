@@ -43,12 +43,17 @@ DRAFTED = {
     "bearing_se3_offset x0 l0 d0": lambda d: d.bearing_se3("x0", "l0", (1, 0, 0), **SPACE, sigmas=[1] * 3),
     "range_se2_offset x0 l0 d0": lambda d: d.range_se2("x0", "l0", 2.0, **PLANE, sigmas=1),
     "range_se3_offset x0 l0 d0": lambda d: d.range_se3("x0", "l0", 2.0, **SPACE, sigmas=1),
+    "point_seen_focal x0 l0 c0": lambda d: d.point_seen("x0", "l0", CAMERA, (1, 2), focal="c0", sigmas=[1] * 2),
+    "point_seen_bundler x0 l0 c0": lambda d: d.point_seen("x0", "l0", CAMERA, (1, 2), bundler="c0", sigmas=[1] * 2),
+    "point_seen_intrinsics x0 l0 c0": lambda d: d.point_seen(
+        "x0", "l0", CAMERA, (1, 2), intrinsics="c0", sigmas=[1] * 2
+    ),
     "point_seen_offset x0 l0 d0": lambda d: d.point_seen("x0", "l0", CAMERA, (1, 2), **SPACE, sigmas=[1] * 2),
 }
 
 
 def test_every_kind_with_further_variables_has_its_keywords() -> None:
-    made = {name.split()[0] for name in DRAFTED}
+    made = {name.split()[0] for name in DRAFTED}  # of kinds with a mount one
     assert made >= {name for name, kind in FACTOR_KINDS.items() if kind.base and "mount" not in kind.modifiers}
 
 
@@ -75,6 +80,10 @@ def test_what_does_not_go_together_is_refused() -> None:
         Draft().landmark_se2("x0", "l0", (1, 2), mount="m0", **PLANE, sigmas=[1] * 2)
     with pytest.raises(BadShape, match="a scale and the mount as numbers"):
         Draft().between_se2("x0", "x1", (1, 0, 0), mount=(1, 0, 0), scale="s0", sigmas=[1] * 3)
+    with pytest.raises(UnknownKind, match="point_seen_focal_intrinsics"):
+        Draft().point_seen("x0", "l0", CAMERA, (1, 2), focal="c0", intrinsics="c1", sigmas=1)
+    with pytest.raises(BadInformation, match="no keyword 'intrinsics'"):
+        Draft().landmark_se3("x0", "l0", (1, 2, 3), intrinsics="c0", sigmas=1)  # type: ignore[call-arg]
     with pytest.raises(BadInformation, match="no keyword 'arm'"):
         Draft().position_se2("x0", (1, 2), lever="a0", arm="a1", sigmas=[1] * 2)  # type: ignore[call-arg]
 

@@ -6,7 +6,8 @@ import numpy as np
 from naive.dense_poses import pose_matrix, pose_vector
 from scipy.linalg import expm
 
-MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset")
+MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset", "focal", "bundler", "intrinsics")
+LENSES = MODIFIERS[-3:]
 
 
 def parts_of(kind: str) -> tuple[str, list[str]]:
@@ -51,9 +52,22 @@ def base_ends(kind: str, ends: list[np.ndarray], z: np.ndarray) -> tuple[list[np
         z = np.concatenate([z, of["arm"]])
     if "scale" in of:
         z[: len(left) - 1] *= of["scale"][0]
+    for lens in LENSES:
+        if lens in of:
+            z[2:] = with_lens(lens, of[lens], z[2:])
     if not {"mount", "offset", "frame"} & of.keys():
         return ends[:count], z
     return [pose_vector(left @ pose_matrix(end) @ right) if len(end) == width else end for end in ends[:count]], z
+
+
+def with_lens(modifier: str, numbers: np.ndarray, lens: np.ndarray) -> np.ndarray:
+    """The lens of a measurement, (code, fu, fv, cx, cy, limit, five of the model), with these numbers in it."""
+    code, fu, fv, cx, cy, limit, *more = lens
+    if modifier == "intrinsics":
+        return np.array([code, *numbers[:4], limit, *numbers[4:]])
+    if modifier == "bundler":
+        more[:2] = numbers[1:]
+    return np.array([code, numbers[0], numbers[0] * fv / fu, cx, cy, limit, *more])
 
 
 def derived_residual(

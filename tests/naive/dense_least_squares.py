@@ -16,6 +16,7 @@ class Connects(dict[str, list[str]]):
         if modifiers:
             space = self[base][0]
             of = {"mount": space, "frame": space, "arm": "vector2" if space == "se2" else "vector3"}
+            of |= {"bundler": "vector3", "intrinsics": "vector9"}
             return [*self[base], *(of.get(modifier, "vector1") for modifier in modifiers)]
         if kind.startswith("imu_"):
             return list(form_of_name(kind).ends)

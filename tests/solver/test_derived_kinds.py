@@ -9,6 +9,7 @@ from naive.dense_covariances import DenseCovariance
 from naive.dense_factors import boxplus, pose_matrix, pose_vector, residual
 from naive.dense_least_squares import DenseGraph, distance, full
 from naive.random_derived import calibration_steps, true_calibration
+from naive.random_lenses import lens_steps, true_lenses
 from naive.random_mounts import mount_steps, true_mounts
 from naive.solver_parts import keys_in, kinds_in, linearization_points
 
@@ -31,7 +32,10 @@ MODES = ["bayes-tree", "inc-l", "all-batch"]
 WORLDS: dict[str, Callable[..., Iterator[Batch]]] = {
     "mounts": mount_steps,
     "calibration": lambda seed, steps=4, **more: calibration_steps(seed, min(steps, 4), **more),
+    "lenses": lambda seed, steps=4, **more: lens_steps(seed, min(steps, 4), **more),
 }
+# How far a settled estimate may be from the optimum: metres, radians; of lenses pixels, of focal lengths of 400.
+SETTLED = {"mounts": 1e-7, "calibration": 1e-7, "lenses": 2e-5}
 DERIVED = {name for name, kind in FACTOR_KINDS.items() if kind.roles}
 every_world = pytest.mark.parametrize("world", WORLDS)
 
@@ -53,7 +57,7 @@ def test_every_kind_with_further_variables_occurs() -> None:
     ("world", "seed", "loss"),
     [
         *(("mounts", seed, loss) for seed in range(3) for loss in ("", "huber", "dcs")),
-        *(("calibration", 0, loss) for loss in ("", "dcs")),
+        *((world, 0, loss) for world in ("calibration", "lenses") for loss in ("", "dcs")),
     ],
 )
 def test_the_settled_estimate_is_the_dense_optimum(world: str, seed: int, loss: str, mode: str) -> None:
@@ -71,9 +75,9 @@ def test_the_settled_estimate_is_the_dense_optimum(world: str, seed: int, loss: 
     solver.step(settle=True)
     twin.put(solver.estimate())
     assert solver.chi2() == pytest.approx(twin.chi2(), rel=1e-9)
-    assert twin.gauss_newton(iterations=1) < 1e-7
+    assert twin.gauss_newton(iterations=1) < SETTLED[world]
     for key, (kind, value) in by_key(solver).items():
-        assert distance(kind, value, twin.values[key]) < 1e-7
+        assert distance(kind, value, twin.values[key]) < SETTLED[world]
 
 
 def solved(world: str, seed: int, mode: str = "bayes-tree", steps: int = 6) -> Solver:
@@ -100,7 +104,7 @@ def close(found: np.ndarray, wanted: np.ndarray, tell: float) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0)])
+@pytest.mark.parametrize(("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0), ("lenses", 0)])
 def test_covariances_are_those_of_the_dense_inverse(world: str, seed: int, mode: str) -> None:
     solver = solved(world, seed, mode)
     twin, blocks, keys = dense(solver), CovarianceBlocks(solver.covariances.factored()), keys_in(solver)
@@ -112,7 +116,7 @@ def test_covariances_are_those_of_the_dense_inverse(world: str, seed: int, mode:
     close(blocks.joint(some), twin.joint([keys[v] for v in some]), 1e-7)
 
 
-@pytest.mark.parametrize(("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0)])
+@pytest.mark.parametrize(("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0), ("lenses", 0)])
 def test_gates_and_gains_are_those_of_dense_matrices(world: str, seed: int) -> None:
     """Candidates of every such kind, among some of two variables."""
     solver, rng = solved(world, seed), np.random.default_rng(seed)
@@ -287,12 +291,16 @@ def test_repair_takes_out_what_a_sensor_saw_wrongly_and_keeps_the_mount() -> Non
     ("world", "held"),
     [
         *(("mounts", held) for held in ("poses", "points", "both", "further", "poses and further")),
-        *(("calibration", held) for held in ("poses", "further")),
+        *((world, held) for world in ("calibration", "lenses") for held in ("poses", "further")),
     ],
 )
 def test_whatever_is_fixed_the_estimate_is_the_dense_optimum(world: str, held: str, mode: str) -> None:
     """With poses and points held the first row of a factor joins nothing that is free: its χ² is a constant."""
-    solver, twin, further = Solver(Options(mode=mode)), DenseGraph(), {*true_mounts(), *true_calibration()}
+    solver, twin, further = (
+        Solver(Options(mode=mode)),
+        DenseGraph(),
+        {*true_mounts(), *true_calibration(), *true_lenses()},
+    )
     known = {"both": ("poses", "points"), "poses and further": ("poses", "further")}.get(held, (held,))
     truth = Solver(Options())
     for batch in WORLDS[world](11, 5):
@@ -318,7 +326,7 @@ def test_whatever_is_fixed_the_estimate_is_the_dense_optimum(world: str, held: s
     solver.step(settle=True)
     twin.put(solver.estimate())
     assert solver.chi2() == pytest.approx(twin.chi2(), rel=1e-9)
-    assert twin.gauss_newton(iterations=1) < 1e-7
+    assert twin.gauss_newton(iterations=1) < SETTLED[world]
     # A factor whose pose and point are held gets a loss, and another goes.
     rows = [n for n, each in enumerate(_by_id(solver)) if each[0].startswith("landmark")]
     changes = [
@@ -336,7 +344,7 @@ def test_whatever_is_fixed_the_estimate_is_the_dense_optimum(world: str, held: s
         left.add(Batch(tuple(groups), tuple(factors)))
         left.put(each.estimate())
         assert each.chi2() == pytest.approx(left.chi2(), rel=1e-9)
-        assert left.gauss_newton(iterations=1) < 1e-6
+        assert left.gauss_newton(iterations=1) < 10 * SETTLED[world]
 
 
 @pytest.mark.parametrize("seed", range(20))

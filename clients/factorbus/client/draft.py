@@ -21,6 +21,7 @@ from factorbus.client.certainty import (
 from factorbus.client.draft_columns import DraftColumns, Held
 from factorbus.client.further import (
     AntennaCertainty,
+    CameraCertainty,
     GnssCertainty,
     Measured,
     OdometryCertainty,
@@ -323,11 +324,15 @@ class Draft:
         point: Key,
         camera: Camera,
         pixel: ArrayLike,
-        **certainty: Unpack[SensorCertainty],
+        **certainty: Unpack[CameraCertainty],
     ) -> Draft:
-        """A point3 seen by the pose's camera: u v (pixels)."""
+        """A point3 seen by the pose's camera: u v (pixels).
+
+        mount=: the key of the camera's pose on the robot; focal=, bundler= or intrinsics=: that of numbers of its lens,
+        in place of the camera's (`factorbus.client.further.CameraCertainty`).
+        """
         measured = [*checked_row("pixel", pixel, 2), *_lens(camera)]
-        return self._seen("point_seen", (pose, point), measured, certainty)
+        return self._add(sensed("point_seen", (pose, point), measured, certainty, CameraCertainty))
 
     def variable(
         self,

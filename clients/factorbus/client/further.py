@@ -1,4 +1,4 @@
-"""What a sensor measures where something of it is a variable: its mount, bias, scale, lever arm, clock.
+"""What a sensor measures where something of it is a variable: its mount, bias, scale, lever arm, clock, lens.
 
 Each is said by a keyword whose value is the key of that variable, and makes another kind of the same measurement:
 `bias="b0"` of a range is `range_se2_bias` (`factorbus.proto.derived_kinds`).
@@ -17,11 +17,12 @@ from factorbus.client.certainty import Certainty, check_names, inverted, transfo
 from factorbus.client.key_numbers import Key, key_number
 from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.proto.arrays import F64
+from factorbus.proto.derived_kinds import LENSES
 from factorbus.proto.problems import BadShape
 from factorbus.proto.symbols import format_symbol
 
 # In the order that names of kinds have them in.
-MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset")
+MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset", *LENSES)
 
 
 class Clock(Certainty, total=False):
@@ -44,6 +45,19 @@ class SensorCertainty(Clock, total=False):
 
     mount: Key | None
     bias: Key | None
+
+
+class CameraCertainty(SensorCertainty, total=False):
+    """The same of a camera, numbers of whose lens are a variable: the key of one of these, to be found out or fixed.
+
+    focal: a `vector1`, the focal length f along u, pixels; that along v is to it as the camera says.
+    bundler: a `vector3`, f (of u and v) k1 k2, as files of bundle adjustment have it; the rest is the camera's.
+    intrinsics: a `vector9`, fx fy cx cy k1 k2 p1 p2 k3 of a pinhole or radtan camera.
+    """
+
+    focal: Key | None
+    bundler: Key | None
+    intrinsics: Key | None
 
 
 class OdometryCertainty(Certainty, total=False):

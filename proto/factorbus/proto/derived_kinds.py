@@ -1,4 +1,4 @@
-"""Kinds of factors that another one becomes with further variables: where a sensor is, what it adds, its clock.
+"""Kinds of factors that another one becomes with further variables: a sensor's place, bias, clock, lens.
 
 `range_se2_bias` is `range_se2` with a bias, `position_se3_frame_arm` is `position_se3` in another frame with a lever
 arm.  Each modifier appends a variable and may change what is measured; the solver evaluates all of them with the
@@ -19,6 +19,14 @@ _SENSORS = (
     *("landmark_se2", "landmark_se3", "bearing_range_se2", "bearing_se2", "bearing_se3", "range_se2", "range_se3"),
     "point_seen",
 )
+# What of a lens is a variable, by modifier: its numbers, which stand in place of those that the measurement has.
+LENSES = {
+    "focal": ("f",),
+    "bundler": ("f", "k1", "k2"),
+    "intrinsics": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
+}
+# Those that are of the radial-tangential model alone.
+RADTAN_LENSES = ("bundler", "intrinsics")
 # Modifiers, and the base kinds that are there with them, in the order of their declaration.
 DERIVED: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
     (("mount",), (*_BETWEEN, *_SENSORS)),
@@ -29,11 +37,20 @@ DERIVED: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
     (("frame", "arm"), _POSITIONS),
     (("offset",), (*_POSITIONS, *_SENSORS)),
     (("frame", "offset"), _POSITIONS),
+    *((modifiers, ("point_seen",)) for lens in LENSES for modifiers in ((lens,), ("mount", lens))),
 )
 # The role of the variable that a modifier appends, where it is a pose: see `FactorKind.roles`.
 _ROLES = {"mount": "mount", "frame": "frame"}
 # Its letter in the table of the contract.
-LETTERS = {"mount": "m", "bias": "β", "scale": "s", "frame": "f", "arm": "λ", "offset": "δ"}
+LETTERS = {
+    "mount": "m",
+    "bias": "β",
+    "scale": "s",
+    "frame": "f",
+    "arm": "λ",
+    "offset": "δ",
+    **dict.fromkeys(LENSES, "c"),
+}
 
 
 def derived_kinds(kinds: Mapping[str, FactorKind]) -> Iterator[FactorKind]:
@@ -84,6 +101,10 @@ def _number(kind: FactorKind) -> FactorKind:
     return _with_end(kind, "vector1")
 
 
+def _lens(modifier: str) -> Callable[[FactorKind], FactorKind]:
+    return lambda kind: _with_end(kind, f"vector{len(LENSES[modifier])}")
+
+
 def _offset(kind: FactorKind) -> FactorKind:
     """Behind the measurement how the robot moves: its velocity and angular velocity, in its own frame."""
     twist = (1.0, 0.25, -0.5) if _dimension(kind) == 2 else (1.0, 0.25, -0.125, 0.0, -0.25, 0.5)
@@ -95,6 +116,11 @@ def _offset(kind: FactorKind) -> FactorKind:
         example=(*kind.example, *twist),
         measured=f"{kind.measured}; ξ: {moves} of the robot, in its frame",
     )
+
+
+def _lens_says(modifier: str) -> Callable[[FactorKind], str]:
+    names = " ".join(LENSES[modifier])
+    return lambda _: f"with {names} of the lens from c (pixels, and the model's own)"
 
 
 def _instead(kind: FactorKind, pose: str) -> str:
@@ -112,6 +138,7 @@ _MODIFIERS: Mapping[str, Callable[[FactorKind], FactorKind]] = {
     "frame": _frame,
     "arm": _arm,
     "offset": _offset,
+    **{lens: _lens(lens) for lens in LENSES},
 }
 _SAYS: Mapping[str, Callable[[FactorKind], str]] = {
     "mount": lambda kind: _instead(kind, "{} ∘ m"),
@@ -120,4 +147,5 @@ _SAYS: Mapping[str, Callable[[FactorKind], str]] = {
     "frame": lambda kind: _instead(kind, "f ∘ {}"),
     "arm": lambda _: "with λ a variable (metres)",
     "offset": lambda kind: _instead(kind, "{} ∘ Exp(ξ δ)") + ", δ in seconds",
+    **{lens: _lens_says(lens) for lens in LENSES},
 }

@@ -9,7 +9,7 @@ from factorbus.formats.errors import FormatError
 from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.ranging import lone_ranges
 from factorbus.formats.robot_log import RobotLog
-from factorbus.formats.steps import Steps, planned, planned_whole
+from factorbus.formats.steps import Steps, at_once, planned, planned_whole
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch
 
@@ -47,14 +47,19 @@ class GraphFile:
     @property
     def landmarks(self) -> int:
         """Number of points."""
-        return self.batch.variable_count - self.poses
+        of = ("point2", "point3", "idp")
+        return sum(len(group.keys) for group in self.batch.variables if group.kind in of)
 
     def steps(self, use_values: bool = False) -> Steps:
         """The replay of the file in time order (see `steps.Steps`).  Raises FormatError for a graph in parts."""
+        if self.dialect == "bal":
+            return at_once(self.batch)
         return planned(self.path, *self._joined(), use_values)
 
     def whole(self, use_values: bool = True) -> Batch:
         """All steps as one insert, with the first pose fixed where the file leaves the choice.  Raises FormatError."""
+        if self.dialect == "bal":
+            return self.batch
         batch, lines, _ = self._joined()
         return planned_whole(self.path, batch, lines, use_values)
 

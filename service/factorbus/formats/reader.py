@@ -20,6 +20,7 @@ from factorbus.formats.offsets import Offsets, leave_cameras, read_offsets
 from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.pyfg import PYFG
 from factorbus.formats.ranging import lone_ranges
+from factorbus.formats.read_bal import BAL, is_bal, read_bal
 from factorbus.formats.read_jrl import is_jrl, read_jrl
 from factorbus.formats.read_pyfg import is_pyfg, read_pyfg
 from factorbus.formats.read_tum import TUM, is_trajectory, read_trajectory
@@ -32,7 +33,7 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol_parts
 from factorbus.wording import counted
 
-READS = (*DIALECTS, PYFG, JRL, TUM)
+READS = (*DIALECTS, PYFG, JRL, TUM, BAL)
 _NAMED = (PYFG, JRL)  # forms whose keys are symbols, and not ids
 
 # A prior of a point that names a pose is one of its position: RTAB-Map writes them so.
@@ -44,10 +45,11 @@ _CAMERAS = ("PARAMS_CAMERACALIB", "PARAMS_STEREOCAMERACALIB")
 def read(
     path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False, whole: bool = False
 ) -> GraphFile:
-    """The graph in `path`: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL or TUM text, plain or gzipped.
+    """The graph in `path`: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, BAL or TUM text, plain or gzipped.
 
-    dialect: "g2o", "toro", "isam", "slam++", "pyfg", "jrl" or "tum"; without it the names of the records decide, and
-    the ending where they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no factors.
+    dialect: "g2o", "toro", "isam", "slam++", "pyfg", "jrl", "bal" or "tum"; without it the names of the records decide,
+    and the ending where they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no
+    factors.  BAL is cameras, their lenses and points, all in one step (`read_bal`).
     Keys are symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols
     and time stamps are, all keys are the ids themselves; of pyfg they are its names, A12 is symbol("A", 12).  JRL
     is JSON: its keys are symbols, what it says beside the graph is `log`, and errors name the place in place of a line.
@@ -66,6 +68,8 @@ def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFi
         left = LeftOut(file, strict, whole)
         batch, turns, log = read_jrl(file, content, left)
         return replace(_graph(file, JRL, batch, turns, left, "keys"), log=log)
+    if dialect == BAL or (dialect is None and is_bal(content)):
+        return read_bal(file, content)
     buckets = buckets_of(file, content)
     if dialect == PYFG or (dialect is None and is_pyfg(path, buckets)):
         left = LeftOut(file, strict, whole)

@@ -97,6 +97,12 @@ def planned(file: str, batch: Batch, lines: Sequence[I64], times: Sequence[I64],
     return _cut(batch, lines, names, scheduled(file, batch, names, use_values), use_values)
 
 
+def at_once(batch: Batch) -> Steps:
+    """A single step, of cameras that have no order in time."""
+    variables = [_VariableColumns(*group, [0, len(group.keys)]) for group in batch.variables]
+    return Steps(1, variables, [_FactorColumns(*group[:6], [0, len(group.keys)]) for group in batch.factors])
+
+
 def planned_whole(file: str, batch: Batch, lines: Sequence[I64], use_values: bool) -> Batch:
     """The same as one batch.  Raises FormatError."""
     names = roster(file, batch)

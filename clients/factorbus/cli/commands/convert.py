@@ -48,8 +48,8 @@ def command(
     ground_truth: bool,
     as_json: bool,
 ) -> None:
-    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg, JRL .jrl or TUM text) and write TARGET (.g2o,
-    .pyfg, .jrl, .tum or .kitti, by its ending).
+    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg, JRL .jrl, BAL or TUM text) and write TARGET
+    (.g2o, .pyfg, .jrl, .tum or .kitti, by its ending).
 
     What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
     letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum. A .tum has each pose's time stamp.

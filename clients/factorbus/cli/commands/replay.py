@@ -118,7 +118,7 @@ class ReplayRequest:
 @robot_options(usual=False)
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
-    """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, or a data set's name) through a map, pose by pose.
+    """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, BAL, or a data set's name) through a map, pose by pose.
 
     Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
     there after every step. What FILE fixes holds the map in place, or its priors; without either the pose of the lowest

@@ -4,6 +4,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from factorbus.proto.derived_kinds import RADTAN_LENSES
+from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import LENS_AT, FactorKind
@@ -14,11 +16,13 @@ from factorbus.solver.kernels.model.bounds import MOST_NUMBER
 from factorbus.solver.lenses import layout as lens_at
 from factorbus.solver.lenses.limits import limit_of
 
+_OF_RADTAN = frozenset(RADTAN_LENSES)
 # Why an observation has no pixel, or a pixel no ray.
 REASONS = {
     lens_at.OUTSIDE_LENS: "beyond where the lens model is one to one",
     lens_at.VERTICAL: "its ray runs along the map's y axis, where azimuth has no meaning",
     lens_at.BEHIND: "what is seen would be behind the camera",
+    lens_at.NO_FOCAL_LENGTH: "its focal length, a variable, is not above 0",
 }
 
 
@@ -76,5 +80,7 @@ def _limit(kind: str, code: float, fu: float, fv: float, _cx: float, _cy: float,
         raise errors.BadLens(kind, f"a pixel of {more[0]:g} × {more[1]:g}", "sizes above 0, mm")
     if limit < 0.0:
         raise errors.BadLens(kind, f"the limit {limit:g}", "0 (as far as the model is one to one), or a radius")
+    if code != lens_at.RADTAN and not _OF_RADTAN.isdisjoint(FACTOR_KINDS[kind].modifiers):
+        raise errors.BadLens(kind, f"the model {code:g}", "1: what is a variable are numbers of radtan and pinhole")
     most = limit_of(int(code), more)
     return min(limit, most) if limit > 0.0 else most

@@ -19,3 +19,4 @@ OUTSIDE_LENS = 2  # where the lens model is not one to one
 OUTSIDE_IMAGE = 3
 VERTICAL = 4  # the ray runs along the world's y axis, where azimuth has no meaning
 BEHIND = 5  # not in front of the camera
+NO_FOCAL_LENGTH = 6  # a focal length that is a variable is not above 0

@@ -8,7 +8,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import observation
 from factorbus.solver.kernels.model.factor_rows import is_one_of_many
-from factorbus.solver.kernels.model.kinds import is_camera, lens_at
+from factorbus.solver.kernels.model.kinds import is_camera, lens_at, lens_is_variable
 from factorbus.solver.kernels.model.many import linearize_many
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.lenses.layout import GOOD, VERTICAL
@@ -21,13 +21,15 @@ _VERTICAL = 1e-6
 def find_lost(new: bool, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64) -> tuple:
     """(the first observation of factors f0 .. f1−1 that has no pixel at `values`, and why); or (−1, GOOD).
 
-    new: it has to be possible as well: a ray through the pixel, and of a first observation one that has an azimuth
+    new: it has to be possible as well: a ray through the pixel where the lens is known, and of a first observation one
+    that has an azimuth
     """
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
         kind = fac[f, at.F_KIND]
         if is_camera(kind) and is_one_of_many(f, fac):
-            status = status_of_pixel(kind, payload, fac[f, at.F_AT]) if new else GOOD
+            known = new and not lens_is_variable(kind)
+            status = status_of_pixel(kind, payload, fac[f, at.F_AT]) if known else GOOD
             if status == GOOD:
                 _, many = linearize_many(f, var, fac, values, payload)
                 status = int(many.r[at.R_STATUS])

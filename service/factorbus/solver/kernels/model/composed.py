@@ -1,4 +1,4 @@
-"""Factors that are another kind with further variables: where and when a sensor measured.  MATH §3.8, §3.9.
+"""Factors that are another kind with further variables: where, when and through what lens.  MATH §3.8, §3.9.
 
 The base kind has its residual at the pose c = f ∘ a ∘ m in place of the pose a, and where its other variable is a pose
 too, at b ∘ m in place of b:
@@ -13,6 +13,7 @@ With A = ∂r/∂c and Ad(m⁻¹) what a displacement of a is of c,
 
 and where the other end is a pose too, that of the sensor in its place, ∂r/∂m has both.  A lever arm that is a variable
 is put into the measurement, ∂r/∂λ = R_c; a bias is added to the residual; a scale stretches the measured translation.
+So are numbers of a lens (`intrinsics`).
 """
 
 import math
@@ -22,6 +23,7 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.exponential import exp_se2, exp_se3
+from factorbus.solver.kernels.model.intrinsics import add_intrinsics, has_focal_length, no_pixel, put_lens
 from factorbus.solver.kernels.model.kinds import (
     ARM,
     BIAS,
@@ -31,6 +33,7 @@ from factorbus.solver.kernels.model.kinds import (
     SCALE,
     base_kind,
     end_of_modifier,
+    lens_is_variable,
     residual_of,
 )
 from factorbus.solver.kernels.model.records import Ends
@@ -65,6 +68,10 @@ def composed(kind: int, x: F64, places: I64, p: F64, k: int, r: F64, J: F64, sta
         for c in range(dim_of(kind_of_end(of, 1))):
             y[SECOND + c] = x[places[1] + c]
     more = residual_of(of, y, Ends(FIRST, SECOND), z, 0, r, A, B)
+    if lens_is_variable(kind):
+        if not has_focal_length(z):
+            more = no_pixel(r, A, B)
+        add_intrinsics(kind, y, Ends(FIRST, SECOND), z, r, A, J, start)
 
     carry_over(has_inner, dim, planar, y, INNER, A, J, start[0])
     if joins_poses:
@@ -89,13 +96,15 @@ def joins_two_poses(kind: int) -> bool:
 
 @inline_kernel
 def put_measurement(kind: int, planar: bool, x: F64, places: I64, p: F64, k: int, z: F64) -> None:
-    """What is measured to z, from 0 on; a lever arm that is a variable goes behind it."""
+    """What is measured to z, from 0 on; a lever arm that is a variable goes behind it, numbers of a lens into it."""
     size, arm = information_at(kind), end_of_modifier(kind, ARM)
     for c in range(size):
         z[c] = p[k + c]
     if arm >= 0:
         for c in range(2 if planar else 3):
             z[size + c] = x[places[arm] + c]
+    if lens_is_variable(kind):
+        put_lens(kind, x, places, z)
 
 
 @inline_kernel

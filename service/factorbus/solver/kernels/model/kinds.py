@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from factorbus.proto.derived_kinds import LENSES
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part, shared_kernel, types
 from factorbus.solver.kernels.model import layout as at
@@ -116,6 +117,9 @@ _EQUATIONS = {
     "frame": "MATH (3.38)",
     "arm": "MATH (3.41)",
     "offset": "MATH (3.40)",
+    "focal": "MATH (3.54)",
+    "bundler": "MATH (3.54)",
+    "intrinsics": "MATH (3.54)",
 }
 FACTOR_MODELS |= {
     name: replace(
@@ -138,7 +142,8 @@ def check_kinds() -> None:
         kind = FACTOR_KINDS[name]
         ends = [VARIABLE_KINDS[end] for end in kind.connects]
         most = MOST_ENDS if model.base else 2
-        if not 1 <= len(ends) <= most or max(kind.dim, *(end.dim for end in ends)) > _MOST:
+        own = ends[: len(FACTOR_KINDS[kind.base or name].connects)]  # the others are in a Jacobian of any width
+        if not 1 <= len(ends) <= most or max(kind.dim, *(end.dim for end in own)) > _MOST:
             raise ImportError(
                 f"the factor kind {name!r} has {len(ends)} ends and a residual of the size {kind.dim}; "
                 f"kernels have room for 1 to {most} variables and {_MOST} numbers"
@@ -214,8 +219,12 @@ JOINS_PLACES = np.array(
 )
 # Whether it says where its first variable is in the map, alone or with other variables that are no places.
 ABSOLUTE = np.array([*(kind.is_absolute for kind in FACTOR_KINDS.values()), *[False] * at.FURTHER_CODES])
-MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset")
-MOUNT, BIAS, SCALE, FRAME, ARM, OFFSET = range(6)
+MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset", *LENSES)
+MOUNT, BIAS, SCALE, FRAME, ARM, OFFSET, FOCAL, BUNDLER, INTRINSICS = range(9)
+# By the code of a kind: whether numbers of its lens are a variable.
+LENS_IS_VARIABLE = np.array(
+    [*(any(of in LENSES for of in kind.modifiers) for kind in FACTOR_KINDS.values()), *[False] * at.FURTHER_CODES]
+)
 # Which variable of a kind is that of a modifier; −1: it has none.
 _MODIFIER_ENDS = np.full((len(_MODELS), len(MODIFIERS)), -1, np.int64)
 for _row, _kind in enumerate(FACTOR_KINDS.values()):
@@ -233,6 +242,12 @@ def base_kind(kind: int) -> int:
 def end_of_modifier(kind: int, modifier: int) -> int:
     """Which of the variables of a kind is that of a modifier, such as MOUNT; −1: it has none."""
     return _MODIFIER_ENDS[kind, modifier]
+
+
+@inline_kernel
+def lens_is_variable(kind: int) -> bool:
+    """Whether numbers of the lens are a variable, and those in the measurement stand for nothing."""
+    return LENS_IS_VARIABLE[kind]
 
 
 @inline_kernel

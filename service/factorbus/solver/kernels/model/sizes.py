@@ -10,7 +10,7 @@ from factorbus.solver.kernels.jit.compile import inline_kernel
 from factorbus.solver.kernels.model import layout as at
 
 _FACTORS, _VARIABLES = tuple(FACTOR_KINDS.values()), tuple(VARIABLE_KINDS.values())
-MOST_ENDS = 3  # of a kind with a fixed number of variables
+MOST_ENDS = 4  # of a kind with a fixed number of variables
 _SIZE = np.array([kind.size for kind in _VARIABLES], np.int64)
 _DIM = np.array([kind.dim for kind in _VARIABLES], np.int64)
 _IS_VECTOR = np.array([kind.is_vector for kind in _VARIABLES])
