@@ -20,7 +20,7 @@ from factorbus.cli.process.options import (
     out_option,
     zenoh_option,
 )
-from factorbus.cli.process.reading import COUNTED, read_graph, reading_options
+from factorbus.cli.process.reading import COUNTED, read_drive, reading_options
 from factorbus.wording import counted
 
 _ANSWER_S, _LISTENING_S = 10.0, 1.0
@@ -107,7 +107,8 @@ class ReplayRequest:
 @reading_options
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
-    """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, or a data set's name) through a map, pose by pose.
+    """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, or a data set's name) through a map, pose by pose; or a
+    folder with a log of an IMU and GNSS, odometry or poses (EuRoC's mav0, KITTI raw, GTSAM's KITTI).
 
     Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
     there after every step. What FILE fixes holds the map in place, or its priors; without either the pose of the lowest
@@ -161,7 +162,7 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
     if request.live:
         require("gateway", "--live")
     request = replace(request, file=source_of(request.file))
-    graph = read_graph(request.file, request.dialect, request.strict)
+    graph = read_drive(request.file, request.dialect, request.strict)
     steps = graph.steps(use_values=request.use_values)
     with _target(request) as target:
         before = target.summary()
