@@ -62,15 +62,15 @@ class Feed:
         self.file = graph.batch
         (poses,) = (group for group in self.file.variables if group.kind == "se2")
         self.poses = np.sort(poses.keys)[:steps]
-        self.start = poses.values[np.argmin(poses.keys)]
+        self.start = valued(poses)[np.argmin(poses.keys)]
         rank = {key: n for n, key in enumerate(self.poses.tolist())}
         self._odometry: list[list[tuple[list[int], F64, F64]]] = [[] for _ in rank]
         self._ranges: list[list[tuple[list[int], F64, F64]]] = [[] for _ in rank]
         for group in self.file.factors:
             of = {"between_se2": self._odometry, "range_se2": self._ranges}[group.kind]
             for keys, z, information in zip(group.keys.tolist(), group.measured, group.information, strict=True):
-                ends = [rank.get(key) for key in keys if key in rank or group.kind == "between_se2"]
-                if None not in ends and ends:
+                ends = [rank[key] for key in keys if key in rank]
+                if len(ends) == (2 if of is self._odometry else 1):
                     of[max(ends)].append((keys, z, information))
         self.waiting: dict[int, Waiting] = {}
         self.entered: list[Entered] = []
@@ -175,6 +175,13 @@ def plaza(table: Path, path: Path, steps: int | None = None) -> Path:
         lines.append(f"EDGE_RANGE {time[pose]:.6f} A{pose} L{int(name)} {z} 1")
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def valued(group: Variables) -> F64:
+    """Its values.  Raises ValueError where it has none."""
+    if group.values is None:
+        raise ValueError(f"variables of kind {group.kind} have no values")
+    return group.values
 
 
 def _factors(kind: str, rows: list[tuple[list[int], F64, F64]]) -> Factors | None:

@@ -33,7 +33,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from bench.range_drives import NAMES, Feed, feed_of, true_places
+from bench.range_drives import NAMES, Feed, feed_of, true_places, valued
 from bench.range_solvers import Isam2, Ours, gtsam_optimum
 from bench.replays.columns import F64
 
@@ -126,7 +126,7 @@ def _row(name: str, solver: str, by: Any, took: list[float], feed: Feed) -> dict
         "cpu_s": round(sum(took), 3), "step_ms": round(1e3 * float(np.median(took)), 3),
         "p99_ms": round(1e3 * float(np.quantile(took, 0.99)), 3),
         "error_m": None if truth is None else _off(at, truth[: len(at)]),
-        "beacon_m": _off(beacons, surveyed.values[is_in]) if len(is_in) > 2 else None,
+        "beacon_m": _off(beacons, valued(surveyed)[is_in]) if len(is_in) > 2 else None,
     }  # fmt: skip
 
 
@@ -147,7 +147,7 @@ def _begun(graph: Batch, start: Mapping[int, F64]) -> list[Variables]:
 
 
 def _by_key(groups: Iterable[Variables]) -> dict[int, F64]:
-    return {key: row for group in groups for key, row in zip(group.keys.tolist(), group.values, strict=True)}
+    return {key: row for group in groups for key, row in zip(group.keys.tolist(), valued(group), strict=True)}
 
 
 if __name__ == "__main__":

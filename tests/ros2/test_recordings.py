@@ -17,7 +17,7 @@ from factorbus.cli.output.exits import BAD_FILE, OK, USAGE
 from factorbus.proto.messages import Batch
 from factorbus.ros2.messages import ODOMETRY
 from factorbus.ros2.problems import BadRecording
-from factorbus.ros2.recorded_drive import RecordedDrive, read_drive
+from factorbus.ros2.recorded_drive import RecordedDrive, read_recording
 from factorbus.ros2.settings import Settings
 
 FOUND = Settings(odometry="", poses=(), landmarks=())
@@ -52,7 +52,7 @@ def whole(drive: recordings.Drive, tmp_path_factory: pytest.TempPathFactory) -> 
 def test_the_same_drive_is_the_same_map_from_each_kind_of_recording(
     drive: recordings.Drive, whole: Path, tmp_path: Path
 ) -> None:
-    reference = read_drive(whole, FOUND)
+    reference = read_recording(whole, FOUND)
     assert reference.steps.poses == 45
     assert reference.used == {"/odom": 45, "/detections": 45}
     others = [
@@ -62,7 +62,7 @@ def test_the_same_drive_is_the_same_map_from_each_kind_of_recording(
         recordings.write_bag(tmp_path / "drive.bag", drive.said),
     ]
     for path in others:
-        assert same(read_drive(path, FOUND), reference), path
+        assert same(read_recording(path, FOUND), reference), path
 
 
 def test_a_recording_is_driven_and_its_map_is_right(
@@ -91,7 +91,7 @@ def test_what_is_left_out_is_said_counted_and_refused_where_that_is_asked(
     """Detections in a frame that nothing places on the robot."""
     said = [each for each in drive.said if each.topic != "/tf_static"]
     path = recordings.write_mcap(tmp_path / "nowhere.mcap", said)
-    made = read_drive(path, FOUND)
+    made = read_recording(path, FOUND)
     assert made.left_out == {"/detections": 45}
     (note,) = [note for note in made.notes if "not used" in note]
     assert "'camera'" in note
@@ -121,9 +121,9 @@ def test_poses_are_left_out_until_they_are_asked_for(
 def test_of_several_odometries_one_is_taken_and_said(drive: recordings.Drive, tmp_path: Path) -> None:
     wheels = [each._replace(topic="/wheels") for each in drive.said if each.topic == "/odom"]
     path = recordings.write_mcap(tmp_path / "two.mcap", [*drive.said, *wheels[:20]])
-    made = read_drive(path, FOUND)
+    made = read_recording(path, FOUND)
     assert "odometry: /odom (of /odom, /wheels; --odom decides)" in made.notes
-    other = read_drive(path, Settings(odometry="/wheels", poses=(), landmarks=()))
+    other = read_recording(path, Settings(odometry="/wheels", poses=(), landmarks=()))
     assert (made.steps.poses, other.steps.poses) == (45, 20)
 
 
@@ -140,16 +140,16 @@ def test_a_recording_without_what_is_wanted_names_what_it_has(
     chosen = [each for each in drive.said if said == "all" or each.topic == "/detections"]
     path = recordings.write_mcap(tmp_path / "lacks.mcap", chosen)
     with pytest.raises(BadRecording, match=wanted):
-        read_drive(path, settings)
+        read_recording(path, settings)
 
 
 def test_of_a_recording_that_was_cut_off_the_beginning_is_driven(whole: Path, tmp_path: Path) -> None:
-    data, reference = whole.read_bytes(), read_drive(whole, FOUND)
+    data, reference = whole.read_bytes(), read_recording(whole, FOUND)
     path, chance, read, refused = tmp_path / "cut.mcap", random.Random(5), 0, 0
     for cut in [0, 4, 8, 60, *sorted(chance.sample(range(100, len(data)), 60))]:
         path.write_bytes(data[:cut])
         try:
-            made = read_drive(path, FOUND)
+            made = read_recording(path, FOUND)
         except BadRecording:
             refused += 1
             continue
@@ -181,7 +181,7 @@ def test_damage_gives_what_can_be_read_or_a_reason_and_never_ends_otherwise(
             del data[chance.randrange(len(data)) :]
         file.write_bytes(data)
         try:
-            made = read_drive(path, FOUND)
+            made = read_recording(path, FOUND)
             outcomes.add("read")
             assert all(np.isfinite(group.measured).all() for batch in made.steps for group in batch.factors)
         except BadRecording:
@@ -232,7 +232,7 @@ def test_at_its_own_rate_a_recording_takes_its_time(
 
 
 def test_space(whole: Path) -> None:
-    made = read_drive(whole, Settings(odometry="", poses=(), landmarks=(), space="space"))
+    made = read_recording(whole, Settings(odometry="", poses=(), landmarks=(), space="space"))
     kinds = {group.kind for batch in made.steps for group in batch.factors}
     assert kinds == {"between_se3", "landmark_se3"}
 
@@ -243,6 +243,6 @@ def test_bytes_that_are_no_message_are_counted(drive: recordings.Drive, tmp_path
             return b"\x00\x01\x00\x00" + b"\xff" * 9
 
     said = [*drive.said[:10], recordings.Said("/odom", ODOMETRY, recordings.START_NS + 5, Broken()), *drive.said[10:]]
-    made = read_drive(recordings.write_mcap(tmp_path / "bytes.mcap", said), FOUND)
+    made = read_recording(recordings.write_mcap(tmp_path / "bytes.mcap", said), FOUND)
     assert made.left_out == {"/odom": 1}
     assert made.steps.poses == 45

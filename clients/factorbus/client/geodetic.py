@@ -19,6 +19,7 @@ from factorbus.proto.problems import BadShape
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 _E2 = FLATTENING * (2.0 - FLATTENING)
+_NEWTON = 6
 
 
 def enu(place: ArrayLike, origin: ArrayLike) -> F64:
@@ -29,6 +30,27 @@ def enu(place: ArrayLike, origin: ArrayLike) -> F64:
     """
     there, here = _checked("place", place), _checked("origin", origin)
     return _axes(here) @ (ecef(there) - ecef(here))
+
+
+def geodetic(east_north_up: ArrayLike, origin: ArrayLike) -> F64:
+    """Latitude, longitude (degrees), height (metres) of metres (3,) east, north and up of `origin`: `enu` backwards.
+
+    Newton's steps on (1) and (2); near the ground three are enough to the last digit.  Raises BadShape,
+    NotFiniteNumbers.
+    """
+    here, wanted = _checked("origin", origin), all_finite("east_north_up", as_numbers("east_north_up", east_north_up))
+    if wanted.shape != (3,):
+        raise BadShape("east_north_up", f"shape {wanted.shape}", "(3,): metres")
+    place = here.copy()
+    for _ in range(_NEWTON):
+        left = _axes(place) @ (_axes(here).T @ (wanted - enu(place, here)))
+        s = np.sin(np.radians(place[0]))
+        N = SEMI_MAJOR_M / np.sqrt(1.0 - _E2 * s * s)
+        meridian = N * (1.0 - _E2) / (1.0 - _E2 * s * s)
+        place[0] += np.degrees(left[1] / (meridian + place[2]))
+        place[1] += np.degrees(left[0] / ((N + place[2]) * np.cos(np.radians(place[0]))))
+        place[2] += left[2]
+    return place
 
 
 def ecef(place: ArrayLike) -> F64:

@@ -55,7 +55,7 @@ class RecordedDrive:
         return {"dialect": "recording", "notes": list(self.notes), **read}
 
 
-def read_drive(path: Path, settings: Settings, strict: bool = False) -> RecordedDrive:
+def read_recording(path: Path, settings: Settings, strict: bool = False) -> RecordedDrive:
     """The drive in a recording.
 
     settings: as a bridge has them; an odometry of "" is found by its type, and so are landmarks where none are named.

@@ -12,18 +12,26 @@ from factorbus.wording import counted
 
 
 @click.command()
-@click.argument("world", type=click.Choice(WORLDS))
+@click.argument("world", type=click.Choice((*WORLDS, "inertial")))
 @click.option("--poses", type=click.IntRange(2, 1_000_000), default=3500, show_default=True, metavar="N")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
 @out_option("--out", "out", "What the robot measured; a .jrl has the truth as well.", "FILE.g2o|.pyfg|.jrl")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Of inertial, in place of --out: an EuRoC folder, which `replay` reads.",
+)
 @out_option("--truth", "truth", "Where it really was, in TUM form.", "FILE.tum")
-def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | None) -> None:
+def command(world: str, poses: int, seed: int, out: Path | None, folder: Path | None, truth: Path | None) -> None:
     """Drive a robot through WORLD and write what it measured.
 
     \b
     manhattan    a drive on a street grid, with loop closures (SE2)
     city-trees   the same streets, with trees seen as landmarks (SE2 and points)
     sphere       round and round a sphere (SE3)
+    inertial     an IMU, GNSS and a camera's odometry; where camera and antenna are on the robot, and where the map is
+                 on the Earth, are to be found out; what is true of it is in truth.json beside (SE3, two poses a second)
 
     The file has no initial estimate but that of the first pose, which is fixed: the reader composes the others from
     the measurements, as `factorbus replay` does.
@@ -31,7 +39,14 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
     \b
     factorbus simulate manhattan --poses 10000 --out m10k.g2o --truth m10k.tum
     factorbus replay m10k.g2o
+    factorbus simulate inertial --poses 200 --folder drive
+    factorbus replay drive --plot drive.png
     """
+    if world == "inertial":
+        _inertial(poses, seed, out, folder, truth)
+        return
+    if folder is not None:
+        raise click.UsageError(f"--folder is of inertial; {world} is one file: --out FILE.g2o")
     if out is None and truth is None:
         raise click.UsageError("there is nothing to write: give --out FILE.g2o, --truth FILE.tum or both")
     from factorbus.cli.driving.columns import merged
@@ -58,6 +73,26 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
         with output_file(truth):
             write_tum(truth, merged(truths))
         screen.print_note(f"{truth}: {counted(poses, 'pose')}, as they are")
+
+
+def _inertial(poses: int, seed: int, out: Path | None, folder: Path | None, truth: Path | None) -> None:
+    if folder is None or out is not None:
+        raise click.UsageError("what sensors measure is no graph: give --folder DIR in place of --out")
+    from factorbus.cli.logs.euroc import read_euroc
+    from factorbus.cli.logs.write_euroc import write_world
+    from factorbus.cli.output import console as screen
+    from factorbus.formats import write_tum
+    from factorbus.proto.messages import Batch
+    from factorbus.simulate import inertial
+
+    with output_file(folder):
+        files = write_world(folder, inertial(poses, seed))
+    screen.print_note(
+        f"{folder}: {counted(poses, 'pose')}, {', '.join(str(each.relative_to(folder)) for each in files)}"
+    )
+    if truth:
+        with output_file(truth):
+            write_tum(truth, Batch(read_euroc(folder / "mav0").steps().truth()))
 
 
 def _steps(world: str, poses: int, seed: int) -> Iterator[Any]:

@@ -122,7 +122,7 @@ class Driven:
         for group in batch.variables:
             if group.kind in ("se2", "se3"):
                 self.poses += len(group.keys)
-            else:
+            elif not group.kind.startswith("vector"):
                 self.landmarks += len(group.keys)
         self.factors += batch.factor_count
 

@@ -9,7 +9,7 @@ from click.core import ParameterSource
 
 from factorbus.cli.driving.replay_source import is_recording
 from factorbus.cli.output.exits import require
-from factorbus.cli.process.reading import read_graph, say
+from factorbus.cli.process.reading import read_drive, say
 from factorbus.ros2.options import RobotOptions
 
 
@@ -28,13 +28,13 @@ def check_kind(file: Path) -> None:
 def read_steps(request: Any) -> tuple[Any, Any]:
     """The graph or the recording that a `ReplayRequest` names, and its steps.  Raises FormatError, BadRecording."""
     if not is_recording(request.file):
-        graph = read_graph(request.file, request.dialect, request.strict)
+        graph = read_drive(request.file, request.dialect, request.strict)
         return graph, graph.steps(use_values=request.use_values)
     require("ros2", "a recording")
-    from factorbus.ros2.recorded_drive import read_drive
+    from factorbus.ros2.recorded_drive import read_recording
     from factorbus.ros2.settings import Settings, robot_settings
 
     settings = robot_settings(request.robot) if request.robot else Settings(odometry="", poses=(), landmarks=())
-    drive = read_drive(request.file, settings, request.strict)
+    drive = read_recording(request.file, settings, request.strict)
     say(request.file, drive.notes)
     return drive, drive.steps

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from factorbus.cli.logs.sensor_log import SensorLog
     from factorbus.formats import GraphFile
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -60,6 +61,18 @@ def read_graph(path: Path, dialect: str | None = None, strict: bool = False, who
     graph = read(path, dialect, strict, whole)
     say(path, graph.notes)
     return graph
+
+
+def read_drive(path: Path, dialect: str | None = None, strict: bool = False) -> "GraphFile | SensorLog":
+    """The same of what can be driven: also a folder with a log of sensors.  Raises FormatError."""
+    if dialect is None and path.exists():
+        from factorbus.cli.logs.recognize import is_log, read_log
+
+        if is_log(path):
+            log = read_log(path)
+            say(path, log.notes)
+            return log
+    return read_graph(path, dialect, strict)
 
 
 def say(path: Path, notes: tuple[str, ...]) -> None:
