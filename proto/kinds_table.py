@@ -70,7 +70,7 @@ def _ends(kind: FactorKind) -> str:
         letters = ["f", "v"]
     elif len(poses) == 1:
         letters = ["x"]
-    elif all(poses):
+    elif all(poses) or kind.connects[0] == kind.connects[1]:
         letters = ["a", "b"]
     else:
         letters = ["a", "y" if kind.connects[1] == "idp" else "l"]
