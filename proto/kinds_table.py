@@ -82,7 +82,7 @@ def _ends(kind: FactorKind) -> str:
         letters = ["x"]
     elif kind.roles:
         letters = ["f", "v"]
-    elif all(poses):
+    elif all(poses) or kind.connects[0] == kind.connects[1]:
         letters = ["a", "b"]
     else:
         letters = ["a", "y" if kind.connects[1] == "idp" else "l"]

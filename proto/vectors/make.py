@@ -32,6 +32,7 @@ from factorbus.proto.messages import (
     Variables,
 )
 from factorbus.proto.problems import Busy
+from factorbus.proto.similarity_kinds import SIMILARITY_KINDS
 from factorbus.proto.symbols import symbol
 
 # The map that inserts and answers are of: stated there, and solved.
@@ -71,6 +72,7 @@ def vectors() -> dict[str, bytes]:
         "insert_calibration": codec.encode_insert(Insert(11, _calibration(), epoch=7)),
         "insert_inertial": codec.encode_insert(Insert(11, _inertial(), epoch=7)),
         "insert_linear_kinds": codec.encode_insert(Insert(9, _linear_kinds(), epoch=7)),
+        "insert_similar": codec.encode_insert(Insert(12, _similar_kinds(), epoch=7)),
         "insert_own_kind": codec.encode_insert(Insert(11, _own_kind(), epoch=7)),
         "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, convert_below=0.1)),
         "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
@@ -203,6 +205,20 @@ def _linear_kinds() -> Batch:
             here += VARIABLE_KINDS[end].size
         groups.append(Factors(kind.name, keys, numbers[None], np.eye(rows)[np.triu_indices(rows)][None]))
     return Batch(tuple(_vectors()), tuple(groups))
+
+
+def _similar_kinds() -> Batch:
+    """Rotations, and poses with a scale: variables, and a factor of each of their kinds."""
+    values = {"so3": [0.0, 0.0, 0.6, 0.8], "sim3": [1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8, 1.5], "point3": [5.0, 6.0, 7.0]}
+    letters, groups = {"so3": "r", "sim3": "s", "point3": "p"}, []
+    for kind in SIMILARITY_KINDS:
+        keys = [symbol(letters[end], 1 + n) for n, end in enumerate(kind.connects)]
+        unit = np.eye(kind.dim)[np.triu_indices(kind.dim)]
+        groups.append(Factors(kind.name, np.array([keys]), np.array([kind.example]), unit[None]))
+    variables = (
+        Variables(kind, symbol(letters[kind], 1) + np.arange(2), np.array([row, row])) for kind, row in values.items()
+    )
+    return Batch(tuple(variables), tuple(groups))
 
 
 def _own_kind() -> Batch:

@@ -14,7 +14,8 @@ from naive.dense_factors import TANGENT, boxminus, boxplus, pose_matrix, pose_ve
 from naive.dense_least_squares import full
 from naive.random_camera_factors import random_camera_factor
 from naive.random_graphs import random_information, random_value
-from naive.random_others import LINEAR, random_other
+from naive.random_lenses import LENS_KINDS, random_lens_factor
+from naive.random_others import LINEAR, SIMILAR_ENDS, random_other
 
 from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, KeyCollision, NoAnchor
 from factorbus.client.frames import compose, difference, inverse, moved_values
@@ -52,6 +53,8 @@ def test_composition_is_that_of_matrices(kind: str, seed: int) -> None:
 
 def random_relative(kind: str, rng: np.random.Generator) -> Any:
     """Values of what a factor of this kind is on, and what is measured."""
+    if kind in LENS_KINDS:
+        return random_lens_factor(kind, rng, "radtan")
     if is_derived(kind):
         ends, z = random_relative(modifiers_of(kind)[0], rng)
         further = [random_value(of, rng) for of in FACTOR_KINDS[kind].connects[len(ends) :]]
@@ -59,6 +62,8 @@ def random_relative(kind: str, rng: np.random.Generator) -> Any:
     if kind in ("idp_first", "idp_seen", "point_seen"):
         return random_camera_factor(kind, rng)[1:]
     ends = [random_value(of, rng) for of in FACTOR_KINDS[kind].connects]
+    if kind.endswith(SIMILAR_ENDS):
+        return ends, random_value("point3" if "landmark" in kind else FACTOR_KINDS[kind].connects[0], rng)
     if kind.startswith("between"):
         return ends, random_value(FACTOR_KINDS[kind].connects[0], rng)
     if kind.startswith("landmark"):

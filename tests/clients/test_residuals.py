@@ -9,6 +9,7 @@ from naive.random_derived import calibration_steps
 from naive.random_graphs import random_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
+from naive.random_similar import similar_steps
 
 from factorbus.cli.driving.columns import merged
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
@@ -37,6 +38,7 @@ WORLDS = [
     (other_steps, 2),
     (sensor_steps, 1),
     (calibrated_steps, 1),
+    (similar_steps, 1),
 ]
 
 

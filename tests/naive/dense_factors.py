@@ -4,7 +4,7 @@ Nothing here shares a formula with them: poses are homogeneous matrices, Jacobia
 """
 
 import numpy as np
-from naive import dense_idp, dense_imu
+from naive import dense_idp, dense_imu, dense_similar
 from naive.dense_derived import derived_residual, is_derived
 from naive.dense_poses import plane_rotation, pose_matrix, pose_vector
 from scipy.spatial.transform import Rotation
@@ -13,7 +13,7 @@ from factorbus.proto.camera import Camera
 from factorbus.proto.inertial import form_of_name
 
 TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3, "idp": 6}
-TANGENT |= {f"vector{n}": n for n in range(1, 10)}
+TANGENT |= {f"vector{n}": n for n in range(1, 10)} | {"so3": 3, "sim3": 7}
 
 
 def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
@@ -24,6 +24,8 @@ def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
         moved = x + delta
         moved[3] = np.angle(np.exp(1j * moved[3]))
         return moved
+    if kind in ("so3", "sim3"):
+        return dense_similar.boxplus(kind, x, delta)
     n = 2 if kind == "se2" else 3
     step = np.eye(n + 1)
     step[:n, n] = delta[:n]
@@ -35,6 +37,8 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     """r of a kind of factor at the values of its variables.  Raises KeyError: it has no twin yet."""
     if is_derived(kind):
         return derived_residual(residual, kind, ends, z)
+    if kind.endswith(("so3", "sim3")) and not kind.startswith("linear"):
+        return dense_similar.residual(kind, ends, z)
     if kind.startswith("velocity_frame"):
         return pose_matrix(ends[0])[:-1, :-1] @ ends[1] - z
     if kind in ("idp_first", "idp_seen", "point_seen"):
@@ -100,6 +104,8 @@ def boxminus(kind: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return x - y
     if kind == "idp":
         return np.where(np.arange(6) == 3, np.angle(np.exp(1j * (x - y))), x - y)
+    if kind in ("so3", "sim3"):
+        return dense_similar.boxminus(kind, x, y)
     error = _pose_error(np.linalg.inv(pose_matrix(y)) @ pose_matrix(x))
     return error if kind == "se2" else error * np.array([1, 1, 1, 2, 2, 2])
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 from naive.dense_derived import parts_of
-from naive.dense_factors import TANGENT, boxplus, jacobians, linear_ends, residual
+from naive.dense_factors import TANGENT, boxminus, boxplus, jacobians, linear_ends, residual
 
 from factorbus.proto.inertial import form_of_name
 
@@ -50,6 +50,13 @@ CONNECTS = Connects({
     "length_vector3": ["vector3"],
     "bearing_se2": ["se2", "point2"],
     "bearing_se3": ["se3", "point3"],
+    "prior_so3": ["so3"],
+    "between_so3": ["so3", "so3"],
+    "attitude_so3": ["so3"],
+    "prior_sim3": ["sim3"],
+    "between_sim3": ["sim3", "sim3"],
+    "landmark_sim3": ["sim3", "point3"],
+    "position_sim3": ["sim3"],
 })  # fmt: skip
 
 
@@ -167,4 +174,6 @@ def distance(kind: str, a: np.ndarray, b: np.ndarray) -> float:
         return float(max(np.abs(a - b)[[0, 1, 2, 4, 5]].max(), abs(np.angle(np.exp(1j * (a[3] - b[3]))))))
     if kind == "se3":
         return float(max(np.abs(a[:3] - b[:3]).max(), min(np.abs(a[3:] - b[3:]).max(), np.abs(a[3:] + b[3:]).max())))
+    if kind in ("so3", "sim3"):
+        return float(np.abs(boxminus(kind, a, b)).max())
     return float(np.abs(a - b).max())

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from naive import dense_similar
 from naive.dense_factors import TANGENT, boxplus, pose_matrix, pose_vector, residual
 from naive.dense_idp import feature, point
 from naive.dense_least_squares import CONNECTS
@@ -23,6 +24,9 @@ def random_value(kind: str, rng: np.random.Generator) -> np.ndarray:
     if kind == "se3":
         q = rng.normal(size=4)
         return np.concatenate([rng.normal(0, 3, 3), q / np.linalg.norm(q)])
+    if kind in ("so3", "sim3"):
+        pose = random_value("se3", rng)
+        return pose[3:] if kind == "so3" else np.append(pose, np.exp(rng.normal(0, 0.7)))
     if kind == "idp":
         return np.array([*rng.normal(0, 3, 3), *rng.uniform(-np.pi, np.pi, 2) * [1.0, 0.4], rng.uniform(0.05, 2.0)])
     return rng.normal(0, 3, TANGENT[kind])
@@ -36,6 +40,8 @@ def random_information(dim: int, rng: np.random.Generator) -> np.ndarray:
 
 def measured(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:
     """What a factor of a kind would measure at these values, with noise."""
+    if kind.endswith(("so3", "sim3")):
+        return dense_similar.measured(kind, ends, noise, rng)
     if kind.startswith("prior_point"):
         return ends[0] + noise * rng.normal(size=len(ends[0]))
     if kind.startswith(("prior", "between")):

@@ -10,6 +10,7 @@ from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
+SIMILAR_ENDS = ("so3", "sim3")  # of rotations and similarities: `random_similar`
 _BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se", "velocity", "length")
 # Of one variable, of two, and of more, with fewer rows than they have scalars, as many, and one more.
 LINEAR = (
@@ -20,7 +21,11 @@ LINEAR = (
     *("linear_9_vector9", "linear_1_vector1_vector1", "linear_7_se3_vector9_se3", "linear_3_se2_vector1_vector9"),
 )
 OTHERS = (
-    *(name for name, kind in FACTOR_KINDS.items() if name.startswith(_BEGINNINGS) and not kind.base),
+    *(
+        name
+        for name, kind in FACTOR_KINDS.items()
+        if name.startswith(_BEGINNINGS) and not kind.base and not name.endswith(SIMILAR_ENDS)
+    ),
     *LINEAR,
 )
 

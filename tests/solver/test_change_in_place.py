@@ -10,8 +10,10 @@ from naive.estimates import apart, values
 from naive.random_derived import calibration_steps
 from naive.random_graphs import camera_steps, random_steps
 from naive.random_imu import imu_steps
+from naive.random_lenses import lens_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
+from naive.random_similar import similar_steps
 from naive.solver_parts import graph_in, row_count
 from naive.tree_records import stays_at_linearization, tree_of
 from naive.tree_solution import assert_is_solution, normal_equations
@@ -36,6 +38,8 @@ WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "mounts": lambda seed: mount_steps(seed),
     "robust mounts": lambda seed: mount_steps(seed, loss="dcs"),
     "calibration": lambda seed: calibration_steps(seed, 6),
+    "lenses": lambda seed: lens_steps(seed, 7),
+    "similarities": lambda seed: similar_steps(seed),
     "inertial": lambda seed: imu_steps(seed, loss="huber"),
 }
 

@@ -11,6 +11,7 @@ from naive.random_derived import calibration_steps
 from naive.random_graphs import camera_steps, random_steps
 from naive.random_imu import imu_steps
 from naive.random_mounts import mount_steps
+from naive.random_similar import similar_steps
 from naive.solver_parts import graph_in
 
 from factorbus.proto.kinds import CHANGES as WIRE_CHANGES
@@ -75,8 +76,15 @@ def test_the_wire_and_the_solver_know_the_same_changes() -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     "steps",
-    [random_steps, lambda seed: camera_steps(seed, loss="huber"), mount_steps, calibration_steps, imu_steps],
-    ids=["robots", "camera", "mounts", "calibration", "inertial"],
+    [
+        random_steps,
+        lambda seed: camera_steps(seed, loss="huber"),
+        mount_steps,
+        calibration_steps,
+        imu_steps,
+        similar_steps,
+    ],
+    ids=["robots", "camera", "mounts", "calibration", "inertial", "similarities"],
 )
 @pytest.mark.parametrize("seed", range(3))
 def test_an_insert_undone_leaves_the_estimate_that_would_have_been_without(

@@ -11,6 +11,7 @@ from naive.dense_least_squares import DenseGraph, distance, full
 from naive.random_derived import calibration_steps, true_calibration
 from naive.random_lenses import lens_steps, true_lenses
 from naive.random_mounts import mount_steps, true_mounts
+from naive.random_similar import SIMILAR, similar_steps
 from naive.solver_parts import keys_in, kinds_in, linearization_points
 
 from factorbus.client import Camera, Draft
@@ -33,10 +34,11 @@ WORLDS: dict[str, Callable[..., Iterator[Batch]]] = {
     "mounts": mount_steps,
     "calibration": lambda seed, steps=4, **more: calibration_steps(seed, min(steps, 4), **more),
     "lenses": lambda seed, steps=4, **more: lens_steps(seed, min(steps, 4), **more),
+    "similarities": similar_steps,
 }
 # How far a settled estimate may be from the optimum: metres, radians; of lenses pixels, of focal lengths of 400.
-SETTLED = {"mounts": 1e-7, "calibration": 1e-7, "lenses": 2e-5}
-DERIVED = {name for name, kind in FACTOR_KINDS.items() if kind.roles}
+SETTLED = {"mounts": 1e-7, "calibration": 1e-7, "lenses": 2e-5, "similarities": 1e-7}
+DERIVED = {name for name, kind in FACTOR_KINDS.items() if kind.roles} | SIMILAR
 every_world = pytest.mark.parametrize("world", WORLDS)
 
 
@@ -57,7 +59,7 @@ def test_every_kind_with_further_variables_occurs() -> None:
     ("world", "seed", "loss"),
     [
         *(("mounts", seed, loss) for seed in range(3) for loss in ("", "huber", "dcs")),
-        *((world, 0, loss) for world in ("calibration", "lenses") for loss in ("", "dcs")),
+        *((world, 0, loss) for world in ("calibration", "lenses", "similarities") for loss in ("", "dcs")),
     ],
 )
 def test_the_settled_estimate_is_the_dense_optimum(world: str, seed: int, loss: str, mode: str) -> None:
@@ -104,7 +106,9 @@ def close(found: np.ndarray, wanted: np.ndarray, tell: float) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0), ("lenses", 0)])
+@pytest.mark.parametrize(
+    ("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0), ("lenses", 0), ("similarities", 0)]
+)
 def test_covariances_are_those_of_the_dense_inverse(world: str, seed: int, mode: str) -> None:
     solver = solved(world, seed, mode)
     twin, blocks, keys = dense(solver), CovarianceBlocks(solver.covariances.factored()), keys_in(solver)
@@ -116,7 +120,9 @@ def test_covariances_are_those_of_the_dense_inverse(world: str, seed: int, mode:
     close(blocks.joint(some), twin.joint([keys[v] for v in some]), 1e-7)
 
 
-@pytest.mark.parametrize(("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0), ("lenses", 0)])
+@pytest.mark.parametrize(
+    ("world", "seed"), [("mounts", 0), ("mounts", 1), ("calibration", 0), ("lenses", 0), ("similarities", 0)]
+)
 def test_gates_and_gains_are_those_of_dense_matrices(world: str, seed: int) -> None:
     """Candidates of every such kind, among some of two variables."""
     solver, rng = solved(world, seed), np.random.default_rng(seed)
@@ -291,7 +297,7 @@ def test_repair_takes_out_what_a_sensor_saw_wrongly_and_keeps_the_mount() -> Non
     ("world", "held"),
     [
         *(("mounts", held) for held in ("poses", "points", "both", "further", "poses and further")),
-        *((world, held) for world in ("calibration", "lenses") for held in ("poses", "further")),
+        *((world, held) for world in ("calibration", "lenses", "similarities") for held in ("poses", "further")),
     ],
 )
 def test_whatever_is_fixed_the_estimate_is_the_dense_optimum(world: str, held: str, mode: str) -> None:

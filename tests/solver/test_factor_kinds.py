@@ -8,7 +8,8 @@ from naive.dense_derived import base_ends, is_derived, parts_of, with_further
 from naive.dense_factors import jacobians, pose_matrix, pose_vector, residual
 from naive.random_camera_factors import CAMERA_KINDS, random_camera_factor
 from naive.random_graphs import random_information, random_value
-from naive.random_others import LINEAR, OTHERS, random_other
+from naive.random_lenses import LENS_KINDS, random_lens_factor
+from naive.random_others import LINEAR, OTHERS, SIMILAR_ENDS, random_other
 
 from factorbus.proto import kinds as wire
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -35,6 +36,8 @@ def base_of(kind: FactorKind) -> str:
 
 def drawn(kind: FactorKind, rng: np.random.Generator) -> np.ndarray:
     """A measurement of anything: a pose or a point, or near the example of the declaration."""
+    if kind.size == kind.connects[0].size and kind.name.endswith(SIMILAR_ENDS):
+        return random_value(kind.connects[0].name, rng)
     of = {2: "point2", 3: "se2", 7: "se3"}.get(kind.size)
     if of is None:
         return np.array(wire.FACTOR_KINDS[kind.name].example) + rng.normal(0, 0.1, kind.size)
@@ -45,7 +48,10 @@ def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Fac
     """Values of the ends, a measurement far from them, and a graph of that one factor."""
     rng = np.random.default_rng(seed)
     base = base_of(kind)
-    if base in CAMERA_KINDS:
+    if kind.name in LENS_KINDS:
+        ends, z = random_lens_factor(kind.name, rng, "radtan")
+        base = kind.name
+    elif base in CAMERA_KINDS:
         _, ends, z = random_camera_factor(base, rng)
     else:
         ends = [random_value(end.name, rng) for end in FACTOR_KINDS[base].connects]
@@ -126,9 +132,18 @@ def check_jacobians(kind: FactorKind, seed: int) -> None:
             np.linalg.norm(end[: len(seen[1])] - seen[1]) < 0.3 for end in seen[:1] if len(seen) == 2 and kind.dim != 6
         ):
             return  # a direction changes without bound near the pose
+    elif wire.FACTOR_KINDS[kind.name].half_angles and base.endswith(SIMILAR_ENDS):
+        turn = r[wire.FACTOR_KINDS[kind.name].half_angle_rows]
+        if 1.0 - turn @ turn < 1e-3:
+            return  # the same of rotations alone, and of similarities
     elif kind.dim == 6 and base not in LINEAR and 1.0 - r[3:] @ r[3:] < 1e-3:
         return  # half a turn apart: the sign of the error quaternion flips within the differences
-    if kind.dim != 6 and base not in LINEAR and np.abs(np.abs(r) - np.pi).min() < 1e-3:
+    if (
+        kind.dim != 6
+        and base not in LINEAR
+        and not base.endswith(SIMILAR_ENDS)
+        and np.abs(np.abs(r) - np.pi).min() < 1e-3
+    ):
         return  # the angle wraps within the differences
     if base == "bearing_range_se2" and r[1] + z[1] < 0.1:
         return  # a bearing changes without bound near the pose

@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 from naive.dense_factors import boxplus, jacobians, pose_matrix, residual
 from naive.dense_least_squares import CONNECTS
-from naive.random_lenses import BELIEVED, LENS_KINDS, random_lens_factor
+from naive.random_lenses import BELIEVED, LENS_KINDS, lens_steps, random_lens_factor
 
 from factorbus.client import Camera, Draft
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.messages import Batch, Change, Factors, Variables
+from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.changing import with_changes
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.linearized import linearized_factor
@@ -141,3 +143,19 @@ def test_focal_length_and_distortion_are_found_from_what_three_cameras_see() -> 
     assert abs(found[0] - truth[0]) < 30
     np.testing.assert_allclose(found[1:], truth[1:], atol=0.05)
     assert solver.chi2() < 180
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_may_go_and_the_lenses_stay(seed: int) -> None:
+    solver = Solver(Options())
+    for batch in lens_steps(seed, 4, noise=0.1):
+        solver.stage(batch)
+        solver.step()
+    solver.step(settle=True)
+    before = {k: v for group in solver.estimate() for k, v in zip(group.keys.tolist(), group.values, strict=True)}
+    gone = np.array([symbol("p", 0), symbol("q", 1), symbol("p", 3)])
+    after = with_changes(solver, [Change("marginalize", keys=gone)], settle=True)[0]
+    left = {k: v for group in after.estimate() for k, v in zip(group.keys.tolist(), group.values, strict=True)}
+    assert set(left) == set(before) - set(gone.tolist())
+    for key, value in left.items():
+        np.testing.assert_allclose(value, before[key], atol=2e-5)  # of lenses pixels

@@ -14,6 +14,7 @@ from naive.random_graphs import camera_steps, random_steps
 from naive.random_imu import imu_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
+from naive.random_similar import similar_steps
 from naive.solver_parts import graph_in, joined_by
 
 from factorbus.proto.kinds import MOST_JOINED
@@ -32,6 +33,7 @@ WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "others": lambda seed: other_steps(seed, 6, noise=0.01),
     "mounts": lambda seed: mount_steps(seed, 5, noise=0.01),
     "calibration": lambda seed: calibration_steps(seed, 4, noise=0.01),
+    "similarities": lambda seed: similar_steps(seed, 6, noise=0.01),
     "inertial": lambda seed: imu_steps(seed, 6),
 }
 seeds = st.integers(0, 2**32 - 1)

@@ -27,7 +27,9 @@ def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 
 def test_these_are_the_kinds_that_place_nobody() -> None:
-    places = {n for n, model in FACTOR_MODELS.items() if model.initializes or model.lens_at >= 0 or model.base}
+    places = {
+        n for n, model in FACTOR_MODELS.items() if model.initializes or model.lens_at >= 0 or model.base or model.joined
+    }
     assert FACTOR_MODELS.keys() - places == set(OTHERS) - set(LINEAR)
     batches = list(other_steps(1))
     there = {group.kind for batch in batches for group in batch.factors}

@@ -166,7 +166,9 @@ def _from_sigmas(where: str, dim: int, sigmas: F64, kind: str) -> F64:
     if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
         raise BadInformation(f"{where}: sigmas", sigmas.tolist(), "positive finite numbers")
     if kind in FACTOR_KINDS and FACTOR_KINDS[kind].half_angles:
-        sigmas = sigmas * (1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
+        halves = np.ones(dim)
+        halves[FACTOR_KINDS[kind].half_angle_rows] = 0.5
+        sigmas = sigmas * halves
     with np.errstate(over="ignore", divide="ignore", under="ignore"):
         information = 1.0 / sigmas**2
     if not (np.isfinite(information).all() and (information > 0).all()):

@@ -5,8 +5,8 @@ Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.0
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TypeVar, Unpack
+from collections.abc import Sequence
+from typing import Unpack
 
 from numpy.typing import ArrayLike
 
@@ -18,7 +18,7 @@ from factorbus.client.certainty import (
     loss_of,
     triangle_of,
 )
-from factorbus.client.draft_columns import DraftColumns, Held
+from factorbus.client.draft_columns import DOWN, DraftColumns, Held, known_kind, lens_numbers, seen_direction
 from factorbus.client.further import (
     AntennaCertainty,
     CameraCertainty,
@@ -38,12 +38,11 @@ from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_num
 from factorbus.client.linear import linear_factor
 from factorbus.client.preintegration import Preintegrated, preintegrated_factor
 from factorbus.proto.camera import Camera
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind, FactorKinds
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind
 from factorbus.proto.messages import Batch
-from factorbus.proto.problems import BadOption, BadShape, UnknownKind
+from factorbus.proto.problems import BadOption, BadShape
 from factorbus.proto.symbols import format_symbol
 
-_Kind = TypeVar("_Kind")
 _DOWN = 0.0, 0.0, -STANDARD_GRAVITY
 
 
@@ -82,6 +81,14 @@ class Draft:
         """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
         return self.variable("idp", key, value, **held)
 
+    def so3(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
+        """A rotation in space: unit quaternion qx qy qz qw."""
+        return self.variable("so3", key, value, **held)
+
+    def sim3(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
+        """A pose in space with a scale: x y z (metres), qx qy qz qw, metres of its unit; p is at t + s R p."""
+        return self.variable("sim3", key, value, **held)
+
     def vector(
         self, key: Key, value: ArrayLike | None = None, *, size: int | None = None, **held: Unpack[Held]
     ) -> Draft:
@@ -116,9 +123,7 @@ class Draft:
         """Where a point in space is in the map: x y z (metres)."""
         return self.factor("prior_point3", (key,), measured, **certainty)
 
-    def between_se2(
-        self, first: Key, second: Key, measured: ArrayLike, **certainty: Unpack[OdometryCertainty]
-    ) -> Draft:
+    def between_se2(self, first: Key, second: Key, measured: ArrayLike, **sure: Unpack[OdometryCertainty]) -> Draft:
         """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures.
 
         mount=: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
@@ -127,11 +132,9 @@ class Draft:
         Or the key of an se2 that is estimated: the mount is to be found out (MATH §3.8).
         scale=: the key of a vector1 that x and y are to be multiplied by, as of wheels of unknown radius (MATH §3.9).
         """
-        return self._add(odometry("between_se2", (first, second), measured, certainty))
+        return self._add(odometry("between_se2", (first, second), measured, sure))
 
-    def between_se3(
-        self, first: Key, second: Key, measured: ArrayLike, **certainty: Unpack[OdometryCertainty]
-    ) -> Draft:
+    def between_se3(self, first: Key, second: Key, measured: ArrayLike, **sure: Unpack[OdometryCertainty]) -> Draft:
         """The second pose in the first one's frame: x y z (metres), qx qy qz qw.
 
         Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
@@ -140,7 +143,31 @@ class Draft:
         mount=: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; or the key of an
         se3.  scale=: as in `between_se2`, of x y z.
         """
-        return self._add(odometry("between_se3", (first, second), measured, certainty))
+        return self._add(odometry("between_se3", (first, second), measured, sure))
+
+    def prior_so3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
+        """How a rotation is in the map: qx qy qz qw.  Three sigmas: about x y z, radians."""
+        return self.factor("prior_so3", (key,), measured, **certainty)
+
+    def between_so3(self, first: Key, second: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
+        """The second rotation in the first one's frame: qx qy qz qw."""
+        return self.factor("between_so3", (first, second), measured, **certainty)
+
+    def prior_sim3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
+        """Where a sim3 is in the map.  Seven sigmas: x y z in its unit, about x y z in radians, of ln of the scale."""
+        return self.factor("prior_sim3", (key,), measured, **certainty)
+
+    def between_sim3(self, first: Key, second: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
+        """The second sim3 in the first one's frame and unit, x y z qx qy qz qw scale.  Sigmas as of `prior_sim3`."""
+        return self.factor("between_sim3", (first, second), measured, **certainty)
+
+    def landmark_sim3(self, pose: Key, point: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
+        """A point3 (metres) in the frame and unit of a sim3: x y z."""
+        return self.factor("landmark_sim3", (pose, point), measured, **certainty)
+
+    def position_sim3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
+        """Where a sim3 is in the map: x y z (metres)."""
+        return self.factor("position_sim3", (key,), measured, **certainty)
 
     def landmark_se2(self, pose: Key, point: Key, measured: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """A point2 in the pose's frame: x y (metres)."""
@@ -150,11 +177,9 @@ class Draft:
         """A point3 in the pose's frame: x y z (metres)."""
         return self._seen("landmark_se3", (pose, point), measured, certainty)
 
-    def bearing_range_se2(
-        self, pose: Key, point: Key, measured: ArrayLike, **certainty: Unpack[SensorCertainty]
-    ) -> Draft:
+    def bearing_range_se2(self, pose: Key, point: Key, measured: ArrayLike, **sure: Unpack[SensorCertainty]) -> Draft:
         """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
-        return self._seen("bearing_range_se2", (pose, point), measured, certainty)
+        return self._seen("bearing_range_se2", (pose, point), measured, sure)
 
     def position_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[AntennaCertainty]) -> Draft:
         """Where an antenna is in the map, or in another frame: x y (metres).
@@ -194,11 +219,16 @@ class Draft:
         return self.factor("heading_se2", (key,), [theta], **certainty)
 
     def attitude_se3(
-        self, key: Key, seen: ArrayLike, *, direction: ArrayLike = (0.0, 0.0, -1.0), **certainty: Unpack[Certainty]
+        self, key: Key, seen: ArrayLike, *, direction: ArrayLike = DOWN, **sure: Unpack[Certainty]
     ) -> Draft:
         """A direction of the map (down, unless said otherwise) as the robot sees it: vectors of any length."""
-        both = [*checked_row("seen", seen, 3), *checked_row("direction", direction, 3)]
-        return self.factor("attitude_se3", (key,), both, **certainty)
+        return self.factor("attitude_se3", (key,), seen_direction(seen, direction), **sure)
+
+    def attitude_so3(
+        self, key: Key, seen: ArrayLike, *, direction: ArrayLike = DOWN, **sure: Unpack[Certainty]
+    ) -> Draft:
+        """The same of a rotation."""
+        return self.factor("attitude_so3", (key,), seen_direction(seen, direction), **sure)
 
     def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """How far a point2 is from the pose (metres)."""
@@ -225,17 +255,10 @@ class Draft:
         return self._seen("bearing_se3", (pose, point), checked_row("direction", direction, 3), certainty)
 
     def imu(
-        self,
-        first: Sequence[Key],
-        second: Sequence[Key],
-        samples: ArrayLike,
-        *,
-        noise: ImuNoise,
-        gravity: Key | ArrayLike = _DOWN,
-        bias: ArrayLike = (0.0,) * 6,
-        mount: Key | ArrayLike | None = None,
+        self, first: Sequence[Key], second: Sequence[Key], samples: ArrayLike, *, noise: ImuNoise,
+        gravity: Key | ArrayLike = _DOWN, bias: ArrayLike = (0.0,) * 6, mount: Key | ArrayLike | None = None,
         **certainty: Unpack[Certainty],
-    ) -> Draft:
+    ) -> Draft:  # fmt: skip
         """What an IMU measured between two moments, each a pose (se3), the IMU's velocity in the map (vector3) and a
         bias (vector6): ("x0", "v0", "b0"), ("x1", "v1", "b1").  Those of the second without a value get it from this.
 
@@ -251,15 +274,9 @@ class Draft:
         return self.factor(kind, of.keys, row, **known_by_noise(certainty))
 
     def imu_preintegrated(
-        self,
-        first: Sequence[Key],
-        second: Sequence[Key],
-        made: Preintegrated,
-        *,
-        gravity: Key | ArrayLike = _DOWN,
-        mount: Key | ArrayLike | None = None,
-        **certainty: Unpack[Certainty],
-    ) -> Draft:
+        self, first: Sequence[Key], second: Sequence[Key], made: Preintegrated, *,
+        gravity: Key | ArrayLike = _DOWN, mount: Key | ArrayLike | None = None, **certainty: Unpack[Certainty],
+    ) -> Draft:  # fmt: skip
         """The same of samples that are integrated already (`preintegrate_samples`): fewer bytes, and to first order in
         the bias.  Without sigmas= or information= (of radians, metres, m/s, and the change of the bias) it is as
         certain as its covariance says."""
@@ -269,15 +286,9 @@ class Draft:
         return self.factor(kind, of.keys, row, **known_by_noise(certainty, known.information))
 
     def linear(
-        self,
-        keys: Sequence[Key],
-        values: Sequence[ArrayLike],
-        jacobians: Sequence[ArrayLike],
-        residual: ArrayLike,
-        *,
-        kinds: Sequence[str] | None = None,
-        **certainty: Unpack[Certainty],
-    ) -> Draft:
+        self, keys: Sequence[Key], values: Sequence[ArrayLike], jacobians: Sequence[ArrayLike],
+        residual: ArrayLike, *, kinds: Sequence[str] | None = None, **certainty: Unpack[Certainty],
+    ) -> Draft:  # fmt: skip
         """What you have linearized yourself, of up to 128 variables: r = sum H (x - y) + b.
 
         x - y is the local increment of a pose, the difference of anything else; values: y of each, as it is stored;
@@ -295,54 +306,42 @@ class Draft:
         return self
 
     def idp_first(
-        self,
-        pose: Key,
-        feature: Key,
-        camera: Camera,
-        pixel: ArrayLike,
-        rho: float,
+        self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, rho: float,
         **certainty: Unpack[FeatureCertainty],
-    ) -> Draft:
+    ) -> Draft:  # fmt: skip
         """A feature where the pose's camera (x right, y down, z forward) saw it first, about 1/rho metres away.
 
         sigma_rho=, of that guess, 1/metre; sigma_pixel=, sigma_anchor= and loss= where the usual ones do not do
         (`factorbus.client.certainty.FeatureCertainty`).
         """
-        measured = [*checked_row("pixel", pixel, 2), rho, *_lens(camera)]
-        sigmas = feature_sigmas(self._named("idp_first", (pose, feature)), certainty)
+        measured = [*checked_row("pixel", pixel, 2), rho, *lens_numbers(camera)]
+        sigmas = feature_sigmas(" ".join(["idp_first", *map(str, (pose, feature))]), certainty)
         return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=certainty.get("loss"))
 
     def idp_seen(
         self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
     ) -> Draft:
         """An idp seen again by the pose's camera: u v (pixels)."""
-        return self.factor("idp_seen", (pose, feature), [*checked_row("pixel", pixel, 2), *_lens(camera)], **certainty)
+        return self.factor(
+            "idp_seen", (pose, feature), [*checked_row("pixel", pixel, 2), *lens_numbers(camera)], **certainty
+        )
 
     def point_seen(
-        self,
-        pose: Key,
-        point: Key,
-        camera: Camera,
-        pixel: ArrayLike,
-        **certainty: Unpack[CameraCertainty],
-    ) -> Draft:
+        self, pose: Key, point: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[CameraCertainty],
+    ) -> Draft:  # fmt: skip
         """A point3 seen by the pose's camera: u v (pixels).
 
         mount=: the key of the camera's pose on the robot; focal=, bundler= or intrinsics=: that of numbers of its lens,
         in place of the camera's (`factorbus.client.further.CameraCertainty`).
         """
-        measured = [*checked_row("pixel", pixel, 2), *_lens(camera)]
+        measured = [*checked_row("pixel", pixel, 2), *lens_numbers(camera)]
         return self._add(sensed("point_seen", (pose, point), measured, certainty, CameraCertainty))
 
     def variable(
-        self,
-        kind: str,
-        key: Key,
-        value: ArrayLike | None = None,
-        **held: Unpack[Held],
-    ) -> Draft:
+        self, kind: str, key: Key, value: ArrayLike | None = None, **held: Unpack[Held],
+    ) -> Draft:  # fmt: skip
         """A variable of any kind of `factorbus.proto.kinds`."""
-        size = _known(VARIABLE_KINDS, kind).size
+        size = known_kind(VARIABLE_KINDS, kind).size
         number = key_number(key)
         where = f"{kind} {format_symbol(number)}"
         row = None if value is None else checked_row(where, value, size)
@@ -352,14 +351,10 @@ class Draft:
         return self
 
     def factor(
-        self,
-        kind: str | FactorKind,
-        keys: Sequence[Key],
-        measured: ArrayLike,
-        **certainty: Unpack[Certainty],
-    ) -> Draft:
+        self, kind: str | FactorKind, keys: Sequence[Key], measured: ArrayLike, **certainty: Unpack[Certainty],
+    ) -> Draft:  # fmt: skip
         """A factor of any kind of `factorbus.proto.kinds`, or of one of your own (`factorbus.client.expressions`)."""
-        of = kind if isinstance(kind, FactorKind) else _known(FACTOR_KINDS, kind)
+        of = kind if isinstance(kind, FactorKind) else known_kind(FACTOR_KINDS, kind)
         kind, numbers = of.name, key_numbers(keys).tolist()
         where = " ".join([of.called, *map(format_symbol, numbers)])
         if len(numbers) != len(of.connects):
@@ -376,10 +371,6 @@ class Draft:
     def _add(self, made: Measured) -> Draft:
         return self.factor(made.kind, made.keys, made.measured, **made.certainty)
 
-    def _named(self, kind: str, keys: tuple[Key, ...]) -> str:
-        """What an error says it is about."""
-        return " ".join([kind, *(format_symbol(key_number(key)) for key in keys)])
-
     def batch(self) -> Batch:
         """What has been drafted so far, as columns."""
         return self._columns.batch()
@@ -388,14 +379,3 @@ class Draft:
 def batch_of(what: str, given: Batch | Draft) -> Batch:
     """What is to go into a map, as columns.  Raises BadOption."""
     return given.batch() if isinstance(given, Draft) else of_type(what, given, Batch, "a Draft or a Batch")
-
-
-def _lens(camera: Camera) -> list[float]:
-    return [*of_type("camera", camera, Camera, "a Camera").lens()]
-
-
-def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
-    if not isinstance(kind, str) or kind not in kinds:
-        known = kinds.names(str(kind)) if isinstance(kinds, FactorKinds) else tuple(kinds)
-        raise UnknownKind("draft", str(kind), known)
-    return kinds[kind]

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TypedDict
+from collections.abc import Mapping
+from typing import TypedDict, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from factorbus.client.arguments import checked_row, of_type
 from factorbus.proto.arrays import F64
+from factorbus.proto.camera import Camera
+from factorbus.proto.kinds import FactorKinds
 from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.problems import UnknownKind
 from factorbus.proto.stamps import NO_STAMP
+
+_Kind = TypeVar("_Kind")
+DOWN = (0.0, 0.0, -1.0)
 
 
 class Held(TypedDict, total=False):
@@ -75,3 +84,21 @@ class DraftColumns:
             for (kind, loss), (keys, measured, information, scales) in self._factors.items()
         ]
         return Batch(tuple(variables), (*factors, *self._linear))
+
+
+def known_kind(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
+    """The kind of that name.  Raises UnknownKind."""
+    if not isinstance(kind, str) or kind not in kinds:
+        known = kinds.names(str(kind)) if isinstance(kinds, FactorKinds) else tuple(kinds)
+        raise UnknownKind("draft", str(kind), known)
+    return kinds[kind]
+
+
+def lens_numbers(camera: Camera) -> list[float]:
+    """The numbers of a lens, as an observation has them.  Raises BadOption."""
+    return [*of_type("camera", camera, Camera, "a Camera").lens()]
+
+
+def seen_direction(seen: ArrayLike, direction: ArrayLike) -> list[float]:
+    """A direction as a robot sees it, and the same in the map.  Raises BadShape."""
+    return [*checked_row("seen", seen, 3), *checked_row("direction", direction, 3)]

@@ -148,6 +148,12 @@ class SE3(Expression):
     named, measures = "se3", "se3"
 
 
+class SO3(Expression):
+    """A rotation in space."""
+
+    named, measures = "so3", "so3"
+
+
 class Point2(Expression):
     """A point in the plane."""
 

@@ -11,7 +11,7 @@ from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.roles import AXES, FRAME, MOUNT
 
 # Numbers of a pose, by the space that a kind of variable is in.
-SPACES = {"se2": 3, "point2": 3, "se3": 7, "point3": 7, "idp": 7}
+SPACES = {"se2": 3, "point2": 3, "se3": 7, "point3": 7, "idp": 7, "so3": 7, "sim3": 7}
 
 
 def compose(T_a_b: F64, poses: F64) -> F64:
@@ -66,6 +66,10 @@ def moved_values(kind: str, values: F64, T_a_b: F64, role: str = "") -> F64:
         return np.concatenate([compose(f, back) for f in values])
     if kind in ("se2", "se3"):
         return compose(T_a_b, values)
+    if kind == "so3":
+        return _product(T_a_b[3:], values)
+    if kind == "sim3":  # the unit of a similarity stays what it is in metres
+        return np.column_stack([compose(T_a_b, values[:, :7]), values[:, 7]])
     size = values.shape[1] if kind != "idp" else 3
     points = values[:, :size] @ rotation_of(T_a_b).T + T_a_b[:size]
     if kind != "idp":

@@ -68,7 +68,7 @@ def _turned(kind: str, role: str, before: F64, after: F64, H: F64, T_a_b: F64) -
         return H @ _adjoint(inverse(T_a_b))
     if role == AXES:
         return H @ R.T
-    if not _moves(kind, role) or kind in ("se2", "se3"):
+    if not _moves(kind, role) or kind in ("se2", "se3", "so3", "sim3"):
         return H
     if kind != "idp":
         return H @ R.T
@@ -99,6 +99,11 @@ def _carried(kind: str, y: F64, role: str) -> F64:
     if kind == "se2":
         R = rotation_of(y)
         return np.block([[R.T, (R.T @ [-y[1], y[0]])[:, None]], [np.zeros((1, 2)), np.ones((1, 1))]])
+    if kind == "so3":
+        return np.column_stack([np.zeros((3, 3)), rotation_of(np.concatenate([np.zeros(3), y])).T])
+    if kind == "sim3":
+        R, moved = rotation_of(y[:7]), np.column_stack([np.eye(3), -_cross(y[:3])])
+        return np.concatenate([R.T @ moved / y[7], np.column_stack([np.zeros((3, 3)), R.T]), np.zeros((1, 6))])
     moved = np.column_stack([np.eye(3), -_cross(y)])
     if kind == "point3":
         return moved

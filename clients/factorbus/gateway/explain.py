@@ -14,6 +14,8 @@ _WORDS = {
     "se3": "a pose in space",
     "point2": "a point",
     "point3": "a point in space",
+    "so3": "a rotation",
+    "sim3": "a pose in space with a scale",
     "idp": "a feature of inverse depth",
 }
 _DOUBTFUL = 2.0

@@ -31,7 +31,7 @@ def closures_of(variables: Sequence[Variables], factors: Sequence[Factors]) -> C
     values = Values(variables)
     keys, misfits = [np.empty((0, 2), np.int64)], [np.empty(0)]
     for group in factors:
-        if group.kind in ("between_se2", "between_se3"):
+        if group.kind in ("between_se2", "between_se3", "between_sim3"):
             chosen = np.fromiter((tuple(pair) in loops for pair in group.keys.tolist()), bool, len(group.keys))
             some = Factors(group.kind, group.keys[chosen], group.measured[chosen], group.information[chosen])
             keys.append(some.keys)

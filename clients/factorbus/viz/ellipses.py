@@ -86,8 +86,8 @@ def _turn(kind: str, value: F64) -> F64:
     if kind == "se2":
         c, s = np.cos(value[2]), np.sin(value[2])
         return np.array([[c, -s], [s, c]])
-    if kind == "se3":
-        x, y, z, w = value[3:]
+    if kind in ("se3", "sim3"):
+        x, y, z, w = value[3:7]
         return np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

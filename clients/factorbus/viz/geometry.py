@@ -8,7 +8,7 @@ import numpy as np
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Variables
 
-POSITION = {"se2": 2, "point2": 2, "se3": 3, "point3": 3}
+POSITION = {"se2": 2, "point2": 2, "se3": 3, "point3": 3, "sim3": 3}
 _LETTER_BITS = 56
 _FLAT = 0.1  # a track whose third extent is below that share of its first is drawn in the plane
 _LINE = 1e-3  # and one whose second extent is below that share lies on a line, which many planes have
@@ -25,12 +25,12 @@ class Track:
 
 def track_of(variables: Sequence[Variables]) -> Track:
     """The poses of `variables` that have a value, by key; places have three columns if any pose is in space."""
-    return _positions(variables, "se")
+    return _positions(variables, ("se2", "se3", "sim3"))
 
 
 def points_of(variables: Sequence[Variables]) -> Track:
     """The points of `variables` likewise."""
-    return _positions(variables, "point")
+    return _positions(variables, ("point2", "point3"))
 
 
 def feature_rays(variables: Sequence[Variables], horizon_m: float = 50.0) -> Track:
@@ -110,8 +110,8 @@ def limits(kept: F64, tried: F64, *, margin: float = 0.04, beyond: float = 0.12)
     return np.stack([low - missing - margin * size, high + missing + margin * size])
 
 
-def _positions(variables: Sequence[Variables], prefix: str) -> Track:
-    mine = [group for group in variables if group.kind.startswith(prefix) and group.values is not None]
+def _positions(variables: Sequence[Variables], kinds: tuple[str, ...]) -> Track:
+    mine = [group for group in variables if group.kind in kinds and group.values is not None]
     width = max((POSITION[group.kind] for group in mine), default=2)
     keys, places = [np.empty(0, np.int64)], [np.empty((0, width))]
     for group in mine:

@@ -155,7 +155,7 @@ def _last_poses(variables: Sequence[Variables]) -> list[tuple[int, F64, int]]:
     """(key, x y z qx qy qz qw, time stamp or NO_STAMP) of the pose with the largest index, for each letter."""
     last: dict[str, tuple[int, F64, int]] = {}
     for group in variables:
-        if group.kind in ("se2", "se3") and group.values is not None:
+        if group.kind in ("se2", "se3", "sim3") and group.values is not None:
             stamps = np.full(group.keys.size, NO_STAMP) if group.stamps is None else group.stamps
             for key, value, stamp in zip(group.keys.tolist(), group.values, stamps.tolist(), strict=True):
                 letter = symbol_parts(key)[0]
@@ -165,9 +165,9 @@ def _last_poses(variables: Sequence[Variables]) -> list[tuple[int, F64, int]]:
 
 
 def lifted(value: F64) -> F64:
-    """A pose (3,) or (7,) as x y z qx qy qz qw."""
-    if len(value) == 7:
-        return value
+    """A pose (3,), (7,) or, with a scale, (8,) as x y z qx qy qz qw."""
+    if len(value) >= 7:
+        return value[:7]
     x, y, theta = value
     return np.array([x, y, 0.0, 0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)])
 
@@ -186,7 +186,7 @@ def _transform(name: str, pose: F64, stamp: fox.Timestamp) -> fox.FrameTransform
 def _poses_in_frame(variables: Sequence[Variables], stamp: fox.Timestamp) -> fox.PosesInFrame:
     poses = []
     for group in variables:
-        if group.kind in ("se2", "se3") and group.values is not None:
+        if group.kind in ("se2", "se3", "sim3") and group.values is not None:
             for value in group.values:
                 x, y, z, qx, qy, qz, qw = lifted(value).tolist()
                 here, turned = fox.Vector3(x=x, y=y, z=z), fox.Quaternion(x=qx, y=qy, z=qz, w=qw)

@@ -63,9 +63,9 @@ def loops_of(batch: Batch) -> I64:
 
     batch: a whole graph, or a step of a replay with its odometry edge.
     """
-    pairs = [group.keys for group in batch.factors if group.kind in ("between_se2", "between_se3")]
+    pairs = [group.keys for group in batch.factors if group.kind in ("between_se2", "between_se3", "between_sim3")]
     keys = np.concatenate([np.empty((0, 2), np.int64), *pairs])
-    poses = [group.keys for group in batch.variables if group.kind in ("se2", "se3")]
+    poses = [group.keys for group in batch.variables if group.kind in ("se2", "se3", "sim3")]
     order = np.unique(np.concatenate([keys.ravel(), *poses]))  # points may have taken numbers between two poses
     ranks = np.searchsorted(order, keys)
     return keys[np.abs(ranks[:, 0] - ranks[:, 1]) > 1]

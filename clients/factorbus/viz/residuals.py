@@ -111,6 +111,24 @@ def _less_se3(a: F64, b: F64) -> F64:
     return np.column_stack([_into_space(a, b), sign * vector, sign * scalar])
 
 
+def _less_so3(a: F64, b: F64) -> F64:
+    """a⁻¹ ∘ b of rotations, with qw ≥ 0."""
+    none = np.zeros((len(a), 3))
+    return _less_se3(np.column_stack([none, a[:, :4]]), np.column_stack([none, b[:, :4]]))[:, 3:]
+
+
+def _less_sim3(a: F64, b: F64) -> F64:
+    """a⁻¹ ∘ b of poses with a scale."""
+    left, scale = _less_se3(a, b), a[:, 7:8]
+    return np.column_stack([left[:, :3] / scale, left[:, 3:], b[:, 7:8] / scale])
+
+
+def _sim3_error(z: F64, x: F64) -> F64:
+    """z⁻¹ ∘ x as x y z, qx qy qz with qw ≥ 0, ln s."""
+    left = _less_sim3(z, x)
+    return np.column_stack([left[:, :6], np.log(left[:, 7])])
+
+
 def _bearing_range(pose: F64, point: F64, z: F64) -> F64:
     u = _into_plane(pose, point)
     return np.column_stack([_wrap(np.arctan2(u[:, 1], u[:, 0]) - z[:, 0]), np.hypot(*u.T) - z[:, 1]])
@@ -192,6 +210,8 @@ _LESS: Mapping[str, Callable[[F64, F64], F64]] = {
     "se2": _less_se2,
     "se3": lambda y, x: _less_se3(y, x)[:, :6] * (1.0, 1.0, 1.0, 2.0, 2.0, 2.0),
     "idp": _less_idp,
+    "so3": lambda y, x: 2.0 * _less_so3(y, x)[:, :3],
+    "sim3": lambda y, x: _sim3_error(y, x) * (1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 1.0),
 }
 _RESIDUALS: dict[str, Callable[..., F64]] = {
     "prior_se2": lambda x, z: _less_se2(z, x),
@@ -216,6 +236,13 @@ _RESIDUALS: dict[str, Callable[..., F64]] = {
     "length_vector3": lambda v, z: np.linalg.norm(v[:, :3], axis=1)[:, None] - z,
     "bearing_se2": lambda a, p, z: _bearing_range(a, p, np.column_stack([z, z]))[:, :1],
     "bearing_se3": lambda a, p, z: _unit(_into_space(a, p)) - _unit(z),
+    "prior_so3": lambda x, z: _less_so3(z, x)[:, :3],
+    "between_so3": lambda a, b, z: _less_so3(z, _less_so3(a, b))[:, :3],
+    "attitude_so3": lambda x, z: _turned_back(x[:, :4], _unit(z[:, 3:])) - _unit(z[:, :3]),
+    "prior_sim3": lambda x, z: _sim3_error(z, x),
+    "between_sim3": lambda a, b, z: _sim3_error(z, _less_sim3(a, b)),
+    "landmark_sim3": lambda a, p, z: _into_space(a, p) / a[:, 7:8] - z,
+    "position_sim3": lambda x, z: x[:, :3] - z,
 }
 _RESIDUALS |= {
     name: derived_residual(kind, _RESIDUALS[kind.base], _compose_se2 if kind.connects[0] == "se2" else _compose_se3)

@@ -17,7 +17,7 @@ class FactorKind:
     measured, residual: for people, and for the table in proto/README.md.  There the variables are a and b of two poses,
     l of a point and y of a feature seen from pose a, m of a mount, and x, or x₁ and x₂, of others.
     example: a measurement, for the golden message of the kind
-    half_angles: the last three rows of the residual are the vector part of a quaternion
+    half_angles: three rows of the residual are the vector part of a quaternion (`half_angle_rows`)
     own: of a kind that a client has written itself, what it is; its name is the formula
     base, modifiers: the kind that this is with further variables, one of each modifier (`derived_kinds`)
     roles: by variable, "" where it is a place in the map or numbers in no frame.  "mount": a pose in the robot's frame,
@@ -44,6 +44,12 @@ class FactorKind:
                 f"the factor kind {self.name!r} has the size {self.size}, and its example {len(self.example)}; "
                 "give an example of a measurement"
             )
+
+    @property
+    def half_angle_rows(self) -> slice:
+        """Which rows of the residual are the vector part of a quaternion: those behind a translation, if any."""
+        first = 3 if self.dim > 3 else 0
+        return slice(first, first + 3) if self.half_angles else slice(0)
 
     @property
     def information_size(self) -> int:

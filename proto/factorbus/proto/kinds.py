@@ -15,6 +15,7 @@ from factorbus.proto.expressions.declaration import BadExpression, Declaration
 from factorbus.proto.expressions.formula import MOST_CHARACTERS, read_formula, write_formula
 from factorbus.proto.expressions.operations import name_of, value_size, zero_of
 from factorbus.proto.factor_kind import LINEAR, FactorKind
+from factorbus.proto.similarity_kinds import SIMILARITY_KINDS
 from factorbus.proto.variable_kinds import POSE2, POSE3, VARIABLE_KINDS
 from factorbus.wording import counted
 
@@ -334,6 +335,7 @@ FACTOR_KINDS = FactorKinds(
         FactorKind(
             "length_vector3", ("vector3",), 1, 1, "length (m/s² of gravity)", "‖x‖ − z", (9.8125,), roles=("axes",)
         ),
+        *SIMILARITY_KINDS,
     )
 )
 # And those that these become with further variables: a mount, a bias, a scale, another frame, a lever arm, a clock.

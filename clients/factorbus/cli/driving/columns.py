@@ -8,7 +8,7 @@ from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
 
-_POSITION = {"se2": 2, "se3": 3, "point2": 2, "point3": 3}  # an idp's first three numbers are a camera's
+_POSITION = {"se2": 2, "se3": 3, "point2": 2, "point3": 3, "sim3": 3}  # an idp's first three numbers are a camera's
 
 
 def merged(batches: Iterable[Batch]) -> Batch:

@@ -1,6 +1,6 @@
 // A map as the page has it: the value of each variable, kept up to date by a WebSocket that comes back by itself.
 
-const POSITION = { se2: 2, se3: 3, point2: 2, point3: 3 };
+const POSITION = { se2: 2, se3: 3, sim3: 3, point2: 2, point3: 3 };
 
 export class LiveMap {
   constructor(name, changed) {
@@ -59,7 +59,7 @@ export class LiveMap {
   tracks() {
     const tracks = new Map();
     for (const [key, { kind }] of this.variables) {
-      if (!kind.startsWith("se")) continue;
+      if (!["se2", "se3", "sim3"].includes(kind)) continue;
       const letter = key.replace(/\d+$/, "");
       if (!tracks.has(letter)) tracks.set(letter, []);
       tracks.get(letter).push(key);

@@ -253,7 +253,7 @@ class Uncertain:
 
     def _last_pose(self) -> I64:
         """The newest that is in the map: no mount of a sensor, no other frame.  Raises NoPose."""
-        poses = [VARIABLE_KINDS[name].code for name in ("se2", "se3")]
+        poses = [VARIABLE_KINDS[name].code for name in ("se2", "se3", "sim3")]
         kinds, counts = self._graph.var[: self._blocks.factored.count, at.V_KIND], self._graph.counts
         aside = variables_aside(self._graph.fac[: counts[at.FACTORS]]).tolist()
         for v in range(kinds.size - 1, -1, -1):

@@ -22,6 +22,7 @@ from typing import Protocol
 
 import numpy as np
 
+from factorbus.proto import kinds as wire
 from factorbus.solver import errors
 from factorbus.solver.changes.carrying import carry_along
 from factorbus.solver.changes.marginal import marginals
@@ -231,11 +232,16 @@ def _checked(kind: str, picked: I64, values: F64, graph: FactorGraph) -> F64:
     keys, values = graph.keys[picked], values.copy()
     for row in np.flatnonzero(~(np.abs(values) <= MOST_NUMBER).all(axis=1)).tolist():
         raise out_of_bounds(f"the value of {kind} {errors.printed(int(keys[row]))}", values[row])
-    if kind == "se3":
-        norms = np.linalg.norm(values[:, 3:], axis=1)
+    at_q, at_s = wire.VARIABLE_KINDS[kind].quaternion_at, wire.VARIABLE_KINDS[kind].scale_at
+    for row in np.flatnonzero(values[:, at_s] < LEAST_SCALE).tolist() if at_s >= 0 else []:
+        where = f"the scale of {kind} {errors.printed(int(keys[row]))}"
+        raise errors.OutOfBounds(where, float(values[row, at_s]), LEAST_SCALE, MOST_NUMBER, "give one above 0")
+    if at_q >= 0:
+        turns = values[:, at_q : at_q + 4]
+        norms = np.linalg.norm(turns, axis=1)
         for row in np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_TOLERANCE).tolist():
             raise errors.BadQuaternion(f"{kind} {errors.printed(int(keys[row]))}", float(norms[row]))
-        values[:, 3:] /= norms[:, None]
+        turns /= norms[:, None]
     if kind in ("se2", "idp"):
         angle = 2 if kind == "se2" else 3
         values[:, angle] -= 2 * np.pi * np.floor((values[:, angle] + np.pi) / (2 * np.pi))

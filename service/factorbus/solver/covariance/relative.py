@@ -8,22 +8,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorbus.proto import kinds as wire
 from factorbus.solver import errors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.graph.groups import FactorGroup
-from factorbus.solver.graph.variables import SE2, SE3, VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+from factorbus.solver.graph.variables import SE2, VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
+SIM3 = "sim3"
 # What measures the second variable in the frame of the first.
 _MEASURED_BY = {
     ("se2", "se2"): "between_se2",
     ("se3", "se3"): "between_se3",
     ("se2", "point2"): "landmark_se2",
     ("se3", "point3"): "landmark_se3",
+    ("so3", "so3"): "between_so3",
+    ("sim3", "sim3"): "between_sim3",
+    ("sim3", "point3"): "landmark_sim3",
 }
 
 
@@ -63,10 +68,10 @@ def _of_kind(blocks: CovarianceBlocks, here: str, there: str, rows: I64, first: 
     keys = np.column_stack([graph.keys[first], graph.keys[second]])
     covariance = evaluate_candidates(blocks, [FactorGroup(kind.name, keys, values, unit)]).predicted
     covariance = covariance[:, : kind.dim, : kind.dim].copy()
-    if there == SE3.name:
-        # The rotation part of a residual in space is half an angle.
-        covariance[:, 3:] *= 2.0
-        covariance[:, :, 3:] *= 2.0
+    # The rotation part of a residual in space is half an angle.
+    halves = wire.FACTOR_KINDS[kind.name].half_angle_rows
+    covariance[:, halves] *= 2.0
+    covariance[:, :, halves] *= 2.0
     return Relative(there, rows, values, covariance)
 
 
@@ -84,12 +89,17 @@ def _seen_from(here: str, there: str, x: F64, y: F64) -> F64:
             return u
         turn = (y[:, 2] - x[:, 2] + np.pi) % (2 * np.pi) - np.pi
         return np.column_stack([u, turn])
-    v, w = -x[:, 3:6], x[:, 6:]
-    d = y[:, :3] - x[:, :3]
-    u = d + 2.0 * np.cross(v, np.cross(v, d) + w * d)
-    if there != SE3.name:
-        return u
-    q = np.hstack(
-        [w * y[:, 3:6] + y[:, 6:] * v + np.cross(v, y[:, 3:6]), w * y[:, 6:] - np.sum(v * y[:, 3:6], 1, keepdims=True)]
-    )
-    return np.hstack([u, q / np.linalg.norm(q, axis=1, keepdims=True)])
+    at_q, other_q = (wire.VARIABLE_KINDS[kind].quaternion_at for kind in (here, there))
+    v, w = -x[:, at_q : at_q + 3], x[:, at_q + 3 : at_q + 4]
+    parts = []
+    if at_q > 0:
+        d = y[:, :3] - x[:, :3]
+        u = d + 2.0 * np.cross(v, np.cross(v, d) + w * d)
+        parts.append(u / x[:, 7:] if here == SIM3 else u)
+    if other_q >= 0:
+        b, s = y[:, other_q : other_q + 3], y[:, other_q + 3 : other_q + 4]
+        q = np.hstack([w * b + s * v + np.cross(v, b), w * s - np.sum(v * b, 1, keepdims=True)])
+        parts.append(q / np.linalg.norm(q, axis=1, keepdims=True))
+    if there == SIM3:
+        parts.append(y[:, 7:] / x[:, 7:])
+    return np.hstack(parts)

@@ -7,6 +7,7 @@ in use; what concerns rows together is checked when all are there.
 import numpy as np
 
 from factorbus.proto import inertial
+from factorbus.proto import kinds as wire
 from factorbus.solver import errors
 from factorbus.solver.graph import observations, own_kinds
 from factorbus.solver.graph.columns import Columns, floats_at, ints_at, limit_lenses, locate_columns
@@ -165,7 +166,10 @@ def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.
     if wrong == gt.DUPLICATE:
         return errors.DuplicateVariable(key)
     if wrong == gt.BAD_QUATERNION and value is not None:
-        return errors.BadQuaternion(where, float(np.linalg.norm(value[3:])))
+        at_q = wire.VARIABLE_KINDS[kind].quaternion_at
+        return errors.BadQuaternion(where, float(np.linalg.norm(value[at_q : at_q + 4])))
+    if (scale := _scale_out_of_bounds(where, kind, value)) is not None:
+        return scale
     return out_of_bounds(f"the value of {where}", np.zeros(0) if value is None else value)
 
 
@@ -185,6 +189,8 @@ def _bad_factor(
         return errors.SelfLoop(keys[later], where)
     if wrong == gt.BAD_QUATERNION:
         return errors.BadQuaternion(where, _worst_norm(kind, measured))
+    if wrong == gt.BAD_RANGE and kind.size == wire.VARIABLE_KINDS["sim3"].size:
+        return _scale_out_of_bounds(where, "sim3", measured) or errors.BadRange(where, float(measured[-1]))
     if wrong == gt.BAD_RANGE:
         return errors.BadRange(where, float(measured[min(1, kind.size - 1)]))
     if wrong == gt.BAD_DIRECTION:
@@ -215,13 +221,21 @@ def _bad_noise(where: str, measured: F64) -> errors.SolverError:
     return errors.BadSamples(where, f"noise densities {seen}", "all above 0, and the last, of integration, 0 or more")
 
 
+def _scale_out_of_bounds(where: str, kind: str, value: F64 | None) -> errors.SolverError | None:
+    """Of a value with a scale that is too small or no number above 0; None: it is not."""
+    at_s = wire.VARIABLE_KINDS[kind].scale_at
+    if value is None or at_s < 0 or value[at_s] >= LEAST_SCALE or not np.isfinite(value).all():
+        return None
+    return errors.OutOfBounds(f"the scale of {where}", float(value[at_s]), LEAST_SCALE, MOST_NUMBER, "give one above 0")
+
+
 def _worst_norm(kind: FactorKind, measured: F64) -> float:
     """Of the quaternions of a measurement the length that is furthest from one."""
-    starts, here = [3], 0
+    starts, here = [0 if kind.size == 4 else 3], 0
     if kind.code == at.LINEAR:
         starts = []
         for end in kind.connects:
-            starts += [here + 3] if end.name == "se3" else []
+            starts += [here + at_q] if (at_q := wire.VARIABLE_KINDS[end.name].quaternion_at) >= 0 else []
             here += end.size
     if kind.code in (at.IMU, at.PREINTEGRATED):
         form = inertial.form_of_name(kind.name)

@@ -364,4 +364,4 @@ def relinearize_cost(kind: int) -> float:
     """How many times the error of planar poses must be reached where a variable of this kind waits.  (9.22)"""
     if kind == at.SE2:
         return 1.0
-    return IN_SPACE if kind == at.SE3 else WITH_LANDMARKS
+    return IN_SPACE if kind == at.SE3 or kind == at.SO3 or kind == at.SIM3 else WITH_LANDMARKS

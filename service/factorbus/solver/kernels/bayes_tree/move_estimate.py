@@ -11,6 +11,7 @@ from factorbus.solver.kernels.model.points import move_point2, move_point3, move
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se2 import turn_se2
 from factorbus.solver.kernels.model.se3 import move_se3
+from factorbus.solver.kernels.model.similarity import move_sim3, move_so3
 from factorbus.solver.kernels.model.sizes import dim_of, is_vector, size_of
 
 # In N_LISTED.
@@ -55,6 +56,10 @@ def move_to(kind: int, lin: F64, x: int, delta: F64, d: int, out: F64) -> None:
         move_point2(lin, x, delta, d, out)
     elif kind == at.IDP:
         move_idp(lin, x, delta, d, out)
+    elif kind == at.SO3:
+        move_so3(lin, x, delta, d, out)
+    elif kind == at.SIM3:
+        move_sim3(lin, x, delta, d, out)
     elif is_vector(kind):
         move_vector(dim_of(kind), lin, x, delta, d, out)
     else:

@@ -13,6 +13,7 @@ from factorbus.solver.kernels.bayes_tree.reroot import MOST_RINGS
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
+from factorbus.solver.kernels.model.sizes import is_pose
 from factorbus.solver.kernels.sparse.amd import ELEMENT, order_nodes, quotient_graph
 
 NEWEST = MOST_RINGS + 3  # the last group: above those of all rings, and that of what is recent
@@ -91,7 +92,7 @@ def group_of(v: int, recent: int, last: int, node: I64, state: I64) -> int:
 def find_newest(count: int, var: I64) -> int:
     """The newest pose that is free, of the first `count` variables; −1: there is none."""
     v = count - 1
-    while v >= 0 and (var[v, at.V_COLUMN] < 0 or (var[v, at.V_KIND] != at.SE2 and var[v, at.V_KIND] != at.SE3)):
+    while v >= 0 and (var[v, at.V_COLUMN] < 0 or not is_pose(var[v, at.V_KIND])):
         v -= 1
     return v
 

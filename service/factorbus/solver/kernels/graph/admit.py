@@ -24,7 +24,7 @@ from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find
 from factorbus.solver.kernels.model.expression_layout import X_RIGID
 from factorbus.solver.kernels.model.factor_rows import row_of_pair, rows_of_arity
 from factorbus.solver.kernels.model.imu_layout import ImuLayout, imu_layout
-from factorbus.solver.kernels.model.kinds import base_kind, is_camera
+from factorbus.solver.kernels.model.kinds import is_camera, is_joined
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import (
     arity_of,
@@ -154,7 +154,7 @@ def append_factors(raw: bytes, group: I64, graph: Graph) -> tuple:
     has_ends = group[gt.G_ENDS] != gt.NOWHERE
     for n in range(arity):
         kinds[n] = int_at(raw, group[gt.G_ENDS] + 8 * n) if has_ends else kind_of_end(kind, n)
-    is_many, scratch = has_ends or base_kind(kind) >= 0, np.empty((dim, dim))
+    is_many, scratch = has_ends or is_joined(kind), np.empty((dim, dim))
     rest, before = (gt.OBSERVED if is_camera(kind) else 0) | (gt.OWN if kind == at.OWN else 0), group[gt.G_LENGTH]
     stored = before + size + kept_of(kind)
     for n in range(group[gt.G_COUNT]):

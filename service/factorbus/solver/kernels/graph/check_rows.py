@@ -11,6 +11,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import (
     LEAST_INFORMATION,
+    LEAST_SCALE,
     MOST_INFORMATION,
     MOST_LINEAR,
     MOST_NUMBER,
@@ -21,7 +22,7 @@ from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.imu_noise import write_root
 from factorbus.solver.kernels.model.kinds import direction_at, positive_at, quaternion_at
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.sizes import information_at, size_of
+from factorbus.solver.kernels.model.sizes import information_at, quaternion_of, scale_of, size_of
 
 # A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
 _QUATERNION_TOLERANCE = 1e-3
@@ -38,9 +39,16 @@ def check_value(kind: int, x: int, size: int, values: F64) -> int:
         values[x + 2] = wrap(values[x + 2])
     if kind == at.IDP:
         values[x + 3] = wrap(values[x + 3])
-    if kind == at.SE3 and not normalize_quaternion(values, x + 3):
+    return check_rotation(kind, x, values)
+
+
+@inline_kernel
+def check_rotation(kind: int, x: int, values: F64) -> int:
+    """What is wrong with quaternion and scale, if it has these, of the value at x of a kind of variable."""
+    turn, scale = quaternion_of(kind), scale_of(kind)
+    if turn >= 0 and not normalize_quaternion(values, x + turn):
         return gt.BAD_QUATERNION
-    return gt.GOOD
+    return gt.OUT_OF_BOUNDS if scale >= 0 and not values[x + scale] >= LEAST_SCALE else gt.GOOD
 
 
 @part
@@ -51,8 +59,9 @@ def check_linear(kinds: I64, p: int, size: int, payload: F64) -> int:
     for n in range(kinds.size):
         if not are_within(MOST_NUMBER, y, size_of(kinds[n]), payload):
             return gt.OUT_OF_BOUNDS
-        if kinds[n] == at.SE3 and not normalize_quaternion(payload, y + 3):
-            return gt.BAD_QUATERNION
+        fault = check_rotation(kinds[n], y, payload)
+        if fault != gt.GOOD:
+            return fault
         y += size_of(kinds[n])
     return gt.GOOD if are_within(MOST_LINEAR, y, p + size - y, payload) else gt.OUT_OF_BOUNDS
 
@@ -113,6 +122,8 @@ def check_measurement(kind: int, p: int, payload: F64) -> int:
         return gt.OUT_OF_BOUNDS
     n = positive_at(kind)
     if n >= 0 and not payload[p + n] > 0.0:
+        return gt.BAD_RANGE
+    if (kind == at.PRIOR_SIM3 or kind == at.BETWEEN_SIM3) and not payload[p + n] >= LEAST_SCALE:
         return gt.BAD_RANGE
     for e in range(2):
         n = direction_at(kind, e)

@@ -21,7 +21,7 @@ from factorbus.solver.kernels.model.composed import (
 )
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, form_of_imu, head_of, is_one_of_many
 from factorbus.solver.kernels.model.imu import BIAS_B, POSE_B, place_by_imu
-from factorbus.solver.kernels.model.kinds import SCALE, base_kind, end_of_modifier, initializes
+from factorbus.solver.kernels.model.kinds import SCALE, base_kind, end_of_modifier, initializes, is_joined
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.se2 import (
     compose_inverse_se2,
@@ -30,6 +30,7 @@ from factorbus.solver.kernels.model.se2 import (
     place_landmark_se2,
 )
 from factorbus.solver.kernels.model.se3 import compose_inverse_se3, compose_se3, place_landmark_se3
+from factorbus.solver.kernels.model.similarity import compose_similar, place_landmark_sim3
 from factorbus.solver.kernels.model.sizes import MOST_ENDS, arity_of, information_at, size_of
 
 _NOTHING = -1
@@ -130,6 +131,8 @@ def follow_many(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F
     of, count, missing = base_kind(fac[f, at.F_KIND]), 0, -1
     if fac[f, at.F_KIND] == at.IMU or fac[f, at.F_KIND] == at.PREINTEGRATED:
         return follow_imu(compose, f, v0, var, fac, x, p, reached)
+    if is_joined(fac[f, at.F_KIND]) and of < 0:
+        return follow_similar(compose, f, v0, var, fac, x, p, reached)
     if of < 0 or not initializes(of):  # a linear factor
         return _NOTHING
     for n in range(count_ends(f, fac)):
@@ -194,6 +197,29 @@ def follow_imu(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F6
         for n in range(places.size):
             places[n] = var[end_of(f, n, fac), at.V_AT]
         place_by_imu(missing, x, places, form_of_imu(f, fac), p[fac[f, at.F_AT] :])
+    reached[new - v0] = 1
+    return new
+
+
+@part
+def follow_similar(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
+    """The same of a factor of rotations or similarities, of one variable or two."""
+    kind, i, j, z = fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT]
+    if not initializes(kind):
+        return _NOTHING
+    has_i, has_j = i < v0 or reached[i - v0] != 0, j < v0 or reached[j - v0] != 0
+    if has_i and has_j:
+        return _NOTHING
+    new = i if not has_i else j
+    if j >= 0 and not has_i and (not has_j or kind == at.LANDMARK_SIM3):
+        return _WAITS
+    if compose and j < 0:
+        for c in range(size_of(var[i, at.V_KIND])):
+            x[var[i, at.V_AT] + c] = p[z + c]
+    elif compose and kind == at.LANDMARK_SIM3:
+        place_landmark_sim3(x, var[i, at.V_AT], p, z, var[j, at.V_AT])
+    elif compose:
+        compose_similar(kind, has_i, var[i, at.V_AT], var[j, at.V_AT], z, x, p)
     reached[new - v0] = 1
     return new
 

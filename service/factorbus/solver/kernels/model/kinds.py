@@ -32,6 +32,7 @@ from factorbus.solver.kernels.model.range_bearing import (
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
 from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
+from factorbus.solver.kernels.model.similarity import similar
 from factorbus.solver.kernels.model.sizes import MOST_ENDS
 from factorbus.solver.kernels.model.velocity import length_vector3, velocity_frame_se2, velocity_frame_se3
 from factorbus.solver.lenses.layout import GOOD
@@ -54,6 +55,7 @@ class FactorModel:
                   returns what χ² has beside rᵀ Ω r
     positive_at:  where in the measurement a number has to be above zero
     quaternions:  where in the measurement quaternions begin.  directions: and directions.  Both become unit
+    joined:       `many` evaluates it (`similarity`), whatever the sizes of its variables
     base:         the kind that it is with further variables (`composed`), whose residual it has
     """
 
@@ -68,6 +70,7 @@ class FactorModel:
     positive_at: int = -1
     quaternions: tuple[int, ...] = ()
     directions: tuple[int, ...] = ()
+    joined: bool = False
     base: str = ""
 
 
@@ -79,6 +82,11 @@ def _usual(residual: Callable[..., Any], equation: str, rigid: bool = False, **m
 def _seen(equation: str, lens_at: int, **more: Any) -> FactorModel:
     """What a camera sees."""
     return FactorModel(observation, equation, of_kinds=True, common=True, lens_at=lens_at, **more)
+
+
+def _similar(equation: str, **more: Any) -> FactorModel:
+    """Of rotations and similarities."""
+    return FactorModel(similar, equation, joined=True, **more)
 
 
 # Kinds are looked for in this order.
@@ -108,6 +116,13 @@ FACTOR_MODELS = {
     "length_vector3": FactorModel(length_vector3, "MATH (3.62)", positive_at=0),
     "bearing_se2": FactorModel(bearing_se2, "MATH (3.24)", rigid=True),
     "bearing_se3": FactorModel(bearing_se3, "MATH (3.25)", rigid=True, directions=(0,)),
+    "prior_so3": _similar("MATH (3.55)", initializes=True, quaternions=(0,)),
+    "between_so3": _similar("MATH (3.55)", initializes=True, quaternions=(0,)),
+    "attitude_so3": _similar("MATH (3.22)", directions=(0, 3)),
+    "prior_sim3": _similar("MATH (3.56)", initializes=True, quaternions=(3,), positive_at=7),
+    "between_sim3": _similar("MATH (3.57)", initializes=True, quaternions=(3,), positive_at=7),
+    "landmark_sim3": _similar("MATH (3.58)", initializes=True),
+    "position_sim3": _similar("MATH (3.59)"),
 }
 # By the last modifier of a kind with a base.
 _EQUATIONS = {
@@ -143,7 +158,7 @@ def check_kinds() -> None:
         ends = [VARIABLE_KINDS[end] for end in kind.connects]
         most = MOST_ENDS if model.base else 2
         own = ends[: len(FACTOR_KINDS[kind.base or name].connects)]  # the others are in a Jacobian of any width
-        if not 1 <= len(ends) <= most or max(kind.dim, *(end.dim for end in own)) > _MOST:
+        if not 1 <= len(ends) <= most or (not model.joined and max(kind.dim, *(end.dim for end in own)) > _MOST):
             raise ImportError(
                 f"the factor kind {name!r} has {len(ends)} ends and a residual of the size {kind.dim}; "
                 f"kernels have room for 1 to {most} variables and {_MOST} numbers"
@@ -221,6 +236,7 @@ JOINS_PLACES = np.array(
 ABSOLUTE = np.array([*(kind.is_absolute for kind in FACTOR_KINDS.values()), *[False] * at.FURTHER_CODES])
 MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset", *LENSES)
 MOUNT, BIAS, SCALE, FRAME, ARM, OFFSET, FOCAL, BUNDLER, INTRINSICS = range(9)
+_JOINED = np.array([model.joined or model.base != "" for model in _MODELS])
 # By the code of a kind: whether numbers of its lens are a variable.
 LENS_IS_VARIABLE = np.array(
     [*(any(of in LENSES for of in kind.modifiers) for kind in FACTOR_KINDS.values()), *[False] * at.FURTHER_CODES]
@@ -242,6 +258,12 @@ def base_kind(kind: int) -> int:
 def end_of_modifier(kind: int, modifier: int) -> int:
     """Which of the variables of a kind is that of a modifier, such as MOUNT; −1: it has none."""
     return _MODIFIER_ENDS[kind, modifier]
+
+
+@inline_kernel
+def is_joined(kind: int) -> bool:
+    """Whether `many` evaluates a kind of fixed sizes: it has a base, or is of rotations or similarities."""
+    return _JOINED[kind]
 
 
 @inline_kernel
@@ -298,7 +320,7 @@ def direction_at(kind: int, n: int) -> int:
     return _DIRECTIONS[kind, n]
 
 
-_alone = {name: model for name, model in FACTOR_MODELS.items() if not model.base}
+_alone = {name: model for name, model in FACTOR_MODELS.items() if not model.base and not model.joined}
 _common = {name: model for name, model in _alone.items() if model.common}
 _others = {name: model for name, model in _alone.items() if not model.common}
 _other_residual_of = inline_kernel(dispatcher("other_residual_of", _others))

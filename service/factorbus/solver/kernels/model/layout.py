@@ -57,6 +57,8 @@ SE3 = VARIABLE_CODES["se3"]
 POINT2 = VARIABLE_CODES["point2"]
 POINT3 = VARIABLE_CODES["point3"]
 IDP = VARIABLE_CODES["idp"]
+SO3 = VARIABLE_CODES["so3"]
+SIM3 = VARIABLE_CODES["sim3"]
 
 # The kind of all linear factors, whose rows and variables are their own.
 LINEAR = len(FACTOR_KINDS)
@@ -88,6 +90,12 @@ HEADING_SE2 = FACTOR_CODES["heading_se2"]
 ATTITUDE_SE3 = FACTOR_CODES["attitude_se3"]
 BEARING_SE2 = FACTOR_CODES["bearing_se2"]
 BEARING_SE3 = FACTOR_CODES["bearing_se3"]
+PRIOR_SO3 = FACTOR_CODES["prior_so3"]
+BETWEEN_SO3 = FACTOR_CODES["between_so3"]
+ATTITUDE_SO3 = FACTOR_CODES["attitude_so3"]
+PRIOR_SIM3 = FACTOR_CODES["prior_sim3"]
+BETWEEN_SIM3 = FACTOR_CODES["between_sim3"]
+LANDMARK_SIM3 = FACTOR_CODES["landmark_sim3"]
 
 # Codes of losses; 0: none.
 NO_LOSS = 0

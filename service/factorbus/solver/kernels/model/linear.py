@@ -4,8 +4,9 @@
 
 y_n the values at which its sender has linearized, H_n its Jacobians there, b its residual there.  A difference is
 a local increment: ⊟ of a pose in the plane is (R_yᵀ (t − t_y), wrap(θ − θ_y)), of one in space (R_yᵀ (t − t_y), 2 v)
-with (v, w) = q_y⁻¹ ⊗ q, w ≥ 0: twice the vector part of a quaternion, the rotation vector to second order.  Of a point
-it is x − y, and of a feature of inverse depth too, its θ wrapped.
+with (v, w) = q_y⁻¹ ⊗ q, w ≥ 0: twice the vector part of a quaternion, the rotation vector to second order.  Of a
+rotation it is 2 v, of a similarity (R_yᵀ (t − t_y) / s_y, 2 v, ln s/s_y).  Of a point it is x − y, and of a feature of
+inverse depth too, its θ wrapped.
 
 Payload: y of each variable, H of each (rows × its tangent, row by row), b (rows).
 """
@@ -42,6 +43,10 @@ def _add_end(end: int, start: int, x: F64, y: F64, H: F64, r: F64, J: F64) -> No
         _add_se2(start, x, y, H, r, J)
     elif end == at.SE3:
         _add_se3(start, x, y, H, r, J)
+    elif end == at.SO3:
+        _add_turn(start, 3, 0, x, y, H, r, J)
+    elif end == at.SIM3:
+        _add_sim3(start, x, y, H, r, J)
     else:
         _add_vector(end, start, x, y, H, r, J)
 
@@ -82,6 +87,43 @@ def _add_se3(start: int, x: F64, y: F64, H: F64, r: F64, J: F64) -> None:
         J[a, start + 3] = h0 * w + h1 * vz - h2 * vy
         J[a, start + 4] = h1 * w - h0 * vz + h2 * vx
         J[a, start + 5] = h2 * w + h0 * vy - h1 * vx
+
+
+@part
+def _add_turn(start: int, width: int, at_q: int, x: F64, y: F64, H: F64, r: F64, J: F64) -> None:
+    """r += H 2 v,  J = H (w I + ⌊v⌋): of the rotation that begins at at_q in the value, and in the tangent, which is
+    `width` wide."""
+    q = at_q
+    vx, vy, vz, w = quat_product(-y[q], -y[q + 1], -y[q + 2], y[q + 3], x[q], x[q + 1], x[q + 2], x[q + 3])
+    if w < 0.0:
+        vx, vy, vz, w = -vx, -vy, -vz, -w
+    w, c = turn_slope(w), start + at_q
+    for a in range(len(J)):
+        h0, h1, h2 = H[width * a + at_q], H[width * a + at_q + 1], H[width * a + at_q + 2]
+        r[a] += 2.0 * (h0 * vx + h1 * vy + h2 * vz)
+        J[a, c], J[a, c + 1], J[a, c + 2] = (
+            h0 * w + h1 * vz - h2 * vy,
+            h1 * w - h0 * vz + h2 * vx,
+            h2 * w + h0 * vy - h1 * vx,
+        )
+
+
+@part
+def _add_sim3(start: int, x: F64, y: F64, H: F64, r: F64, J: F64) -> None:
+    """r += H (x ⊟ y),  J = H [ (s/s_y) R_yᵀ R | 0 | 0 ; 0 | w I + ⌊v⌋ | 0 ; 0 | 0 | 1 ]."""
+    z, q, s = rotation_matrix(y, 3), rotation_matrix(x, 3), 1.0 / y[7]
+    d0, d1, d2 = s * (x[0] - y[0]), s * (x[1] - y[1]), s * (x[2] - y[2])
+    ratio = s * x[7]
+    for a in range(len(J)):
+        n = 7 * a
+        m0 = H[n] * z[0] + H[n + 1] * z[1] + H[n + 2] * z[2]  # of H's translation part times R_yᵀ
+        m1 = H[n] * z[3] + H[n + 1] * z[4] + H[n + 2] * z[5]
+        m2 = H[n] * z[6] + H[n + 1] * z[7] + H[n + 2] * z[8]
+        r[a] += m0 * d0 + m1 * d1 + m2 * d2 + H[n + 6] * math.log(ratio)
+        for b in range(3):
+            J[a, start + b] = ratio * (m0 * q[b] + m1 * q[3 + b] + m2 * q[6 + b])
+        J[a, start + 6] = H[n + 6]
+    _add_turn(start, 7, 3, x, y, H, r, J)
 
 
 @inline_kernel

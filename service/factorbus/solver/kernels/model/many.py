@@ -3,7 +3,7 @@
 Their Jacobians stand side by side in J, in the order of the variables, each as wide as its variable has scalars; r and
 J are times C with CᵀC = Ω, so that Ω is one from here on.  One kind is the linear model (3.26), of any variables, one
 what an IMU says between two poses (`imu`), and one stands for all kinds that clients wrote themselves (`expressions`).
-The others are kinds with a base (`composed`).
+The others are kinds with a base (`composed`), and those of rotations and similarities (`similarity`).
 """
 
 import math
@@ -24,8 +24,10 @@ from factorbus.solver.kernels.model.factor_rows import (
     residual_size,
 )
 from factorbus.solver.kernels.model.imu import imu
+from factorbus.solver.kernels.model.kinds import base_kind
 from factorbus.solver.kernels.model.linear import linear
 from factorbus.solver.kernels.model.losses import loss_of
+from factorbus.solver.kernels.model.similarity import similar
 from factorbus.solver.kernels.model.sizes import dim_of
 
 _FLOATS, _ROWS = types.float64[::1], types.int64[:, ::1]
@@ -77,6 +79,8 @@ def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) 
         linear(x, kinds, places, payload[fac[f, at.F_AT] :], many.r, many.J)
     elif kind == at.IMU or kind == at.PREINTEGRATED:
         imu(x, places, form_of_imu(f, fac), payload[fac[f, at.F_AT] :], kept, many.r, many.J)
+    elif base_kind(kind) < 0:
+        similar(kind, x, places, payload, fac[f, at.F_AT], many.r, many.J)
     else:
         more = composed(kind, x, places, payload, fac[f, at.F_AT], many.r, many.J, start)
     return more, many

@@ -9,10 +9,19 @@ from factorbus.solver.kernels.model.points import move_point2, move_point3, move
 from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.se2 import move_se2
 from factorbus.solver.kernels.model.se3 import move_se3
+from factorbus.solver.kernels.model.similarity import move_sim3, move_so3
 from factorbus.solver.kernels.model.sizes import dim_of, is_vector, size_of
 
 # x ⊞ δ of every kind of variables of the wire, `factorbus.proto.kinds`, but of vectors, which have one.
-MOVES = {"se2": move_se2, "se3": move_se3, "point2": move_point2, "idp": move_idp, "point3": move_point3}
+MOVES = {
+    "se2": move_se2,
+    "se3": move_se3,
+    "point2": move_point2,
+    "idp": move_idp,
+    "point3": move_point3,
+    "so3": move_so3,
+    "sim3": move_sim3,
+}
 _CODES = {name: code for name, code in at.VARIABLE_CODES.items() if not VARIABLE_KINDS[name].is_vector}
 check_same("variable kind", _CODES, MOVES, __name__)
 

@@ -13,6 +13,9 @@ _FACTORS, _VARIABLES = tuple(FACTOR_KINDS.values()), tuple(VARIABLE_KINDS.values
 MOST_ENDS = 4  # of a kind with a fixed number of variables
 _SIZE = np.array([kind.size for kind in _VARIABLES], np.int64)
 _DIM = np.array([kind.dim for kind in _VARIABLES], np.int64)
+_QUATERNION_AT = np.array([kind.quaternion_at for kind in _VARIABLES], np.int64)
+_SCALE_AT = np.array([kind.scale_at for kind in _VARIABLES], np.int64)
+_IS_POSE = np.array([kind.is_pose for kind in _VARIABLES])
 _IS_VECTOR = np.array([kind.is_vector for kind in _VARIABLES])
 MOST_SCALARS = int(_DIM.max())  # of one variable: the size of the scratch that kernels have for it
 # By the code of a kind of factor; the last are of members, and of families, whose sizes are each factor's own.
@@ -43,6 +46,24 @@ def dim_of(kind: int) -> int:
 def is_vector(kind: int) -> bool:
     """Whether a kind of variable is plain numbers, whose ⊞ is +."""
     return _IS_VECTOR[kind]
+
+
+@inline_kernel
+def is_pose(kind: int) -> bool:
+    """Whether a kind of variable is a place and how something is turned there."""
+    return _IS_POSE[kind]
+
+
+@inline_kernel
+def quaternion_of(kind: int) -> int:
+    """Where in a value its quaternion begins; −1: it has none."""
+    return _QUATERNION_AT[kind]
+
+
+@inline_kernel
+def scale_of(kind: int) -> int:
+    """Where in a value its scale is; −1: it has none."""
+    return _SCALE_AT[kind]
 
 
 @inline_kernel
