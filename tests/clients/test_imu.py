@@ -57,7 +57,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Problem], str]] = {
     "gravity": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, gravity=(9.81,)), BadShape, "gravity"),
     "mount": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, mount=(0, 0, 1)), BadShape, "mount"),
     "no rotation": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, mount=[0] * 6 + [2]), BadShape, "mount.*length 2"),
-    "samples": (lambda: Draft().imu_preintegrated(A, B, SAMPLES), BadOption, "a Preintegrated"),  # type: ignore[arg-type]
+    "samples": (lambda: Draft().imu_preintegrated(A, B, SAMPLES), BadOption, "a PreintegratedImu"),  # type: ignore[arg-type]
     "certain": (
         lambda: Draft().imu_preintegrated(A, B, preintegrate_samples(SAMPLES[:1], NOISE)),
         BadInformation,

@@ -156,7 +156,7 @@ def test_integrated_at_a_hundred_times_the_rate_it_is_the_same_to_the_order_of_a
     for parts in (1, 10):
         off = []
         for _ in range(4):
-            z = random_imu(ImuForm(10), rng, 0.5)
+            z = random_imu(ImuForm(10), rng, 0.5, mounted=False)
             z = at_rate(z, parts)
             _, p, v, T = integrate(at_rate(z, 100)[START:].reshape(-1, of.SAMPLE), np.zeros(6))
             (delta, total) = ours(z, np.zeros(6))

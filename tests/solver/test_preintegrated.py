@@ -9,7 +9,7 @@ from gtsam.symbol_shorthand import B, V, X
 from naive.random_imu import GRAVITY, NOISE, keys_of, random_ends, random_samples
 from scipy.spatial.transform import Rotation
 
-from factorbus.client import Draft, ImuNoise, Preintegrated, preintegrate_samples
+from factorbus.client import Draft, ImuNoise, PreintegratedImu, preintegrate_samples
 from factorbus.proto.inertial import ImuForm
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.problems import BadInformation
@@ -23,14 +23,14 @@ A, AFTER = ("x0", "v0", "b0"), ("x1", "v1", "b1")
 SENSOR = ImuNoise(*NOISE)
 
 
-def batch_of(made: Preintegrated, ends: list[np.ndarray]) -> Batch:
+def batch_of(made: PreintegratedImu, ends: list[np.ndarray]) -> Batch:
     keys = np.array(keys_of(0) + keys_of(1))
     variables = tuple(Variables(kind, keys[n : n + 1], ends[n][None]) for n, kind in enumerate(KINDS))
     draft = Draft().imu_preintegrated(A, AFTER, made, gravity=GRAVITY)
     return Batch(variables, draft.batch().factors)
 
 
-def linearized(made: Preintegrated, ends: list[np.ndarray]) -> Linearized:
+def linearized(made: PreintegratedImu, ends: list[np.ndarray]) -> Linearized:
     graph = FactorGraph()
     admit(graph, batch_of(made, ends))
     return linearized_factor(graph, 0)
@@ -140,7 +140,7 @@ def test_with_its_covariance_chi2_is_that_of_gtsams_combined_imu_factor(seed: in
     assert error @ found.W @ error == pytest.approx(2.0 * factor.error(values), rel=1e-7)
 
 
-def from_gtsam(theirs: Any, bias: np.ndarray, covariance: np.ndarray) -> Preintegrated:
+def from_gtsam(theirs: Any, bias: np.ndarray, covariance: np.ndarray) -> PreintegratedImu:
     """What GTSAM has integrated at `bias`.  Derivatives by it are not among what its wrapper tells, but differences of
     what it predicts are; covariance: of our 15 numbers."""
     h, J = 1e-5, np.empty((9, 6))
@@ -150,7 +150,7 @@ def from_gtsam(theirs: Any, bias: np.ndarray, covariance: np.ndarray) -> Preinte
         turn = Rotation.from_matrix(back[0].T @ ahead[0]).as_rotvec()
         J[:, c] = np.concatenate([turn, ahead[1] - back[1], ahead[2] - back[2]]) / (2 * h)
     q = Rotation.from_matrix(R).as_quat()
-    return Preintegrated(theirs.deltaTij(), q, p, v, bias, J[:3, :3], J[3:6], J[6:], covariance)
+    return PreintegratedImu(theirs.deltaTij(), q, p, v, bias, J[:3, :3], J[3:6], J[6:], covariance)
 
 
 def predicted(theirs: Any, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
-from factorbus.client.preintegration import Preintegrated, preintegrate_samples
+from factorbus.client.preintegration import PreintegratedImu, preintegrate_samples
 from factorbus.client.snapshot import Snapshot
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
@@ -44,7 +44,7 @@ __all__ = [
     "NoAnswerYet",
     "NotConverged",
     "PendingInsert",
-    "Preintegrated",
+    "PreintegratedImu",
     "Problem",
     "Refused",
     "Snapshot",

@@ -36,7 +36,7 @@ from factorbus.client.geodetic import enu
 from factorbus.client.imu import STANDARD_GRAVITY, ImuNoise, imu_factor, known_by_noise, moments
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.linear import linear_factor
-from factorbus.client.preintegration import Preintegrated, preintegrated_factor
+from factorbus.client.preintegration import PreintegratedImu, preintegrated_factor
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind
 from factorbus.proto.messages import Batch
@@ -274,14 +274,14 @@ class Draft:
         return self.factor(kind, of.keys, row, **known_by_noise(certainty))
 
     def imu_preintegrated(
-        self, first: Sequence[Key], second: Sequence[Key], made: Preintegrated, *,
+        self, first: Sequence[Key], second: Sequence[Key], made: PreintegratedImu, *,
         gravity: Key | ArrayLike = _DOWN, mount: Key | ArrayLike | None = None, **certainty: Unpack[Certainty],
     ) -> Draft:  # fmt: skip
         """The same of samples that are integrated already (`preintegrate_samples`): fewer bytes, and to first order in
         the bias.  Without sigmas= or information= (of radians, metres, m/s, and the change of the bias) it is as
         certain as its covariance says."""
         of = moments("imu_preintegrated", first, second, gravity, mount)
-        known = of_type(f"{of.where}: made", made, Preintegrated, "a Preintegrated")
+        known = of_type(f"{of.where}: made", made, PreintegratedImu, "a PreintegratedImu")
         kind, row = preintegrated_factor(of, known)
         return self.factor(kind, of.keys, row, **known_by_noise(certainty, known.information))
 

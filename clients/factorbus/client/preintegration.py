@@ -33,7 +33,7 @@ _TOLERANCE = 1e-3  # how far a quaternion may be from unit length
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Preintegrated:
+class PreintegratedImu:
     """What an IMU measured between two moments, integrated at a bias, in the frame where it begins.
 
     duration: T, seconds.  attitude (4,): Delta R, qx qy qz qw.  position, velocity (3,): Delta p, Delta v, metres, m/s.
@@ -57,14 +57,16 @@ class Preintegrated:
 
     def __post_init__(self) -> None:
         for name, shape in _SHAPES.items():
-            given = all_finite(f"Preintegrated: {name}", as_numbers(f"Preintegrated: {name}", getattr(self, name)))
+            given = all_finite(
+                f"PreintegratedImu: {name}", as_numbers(f"PreintegratedImu: {name}", getattr(self, name))
+            )
             if given.shape != shape:
-                raise BadShape(f"Preintegrated: {name}", f"shape {given.shape}", f"shape {shape}")
+                raise BadShape(f"PreintegratedImu: {name}", f"shape {given.shape}", f"shape {shape}")
             object.__setattr__(self, name, given)
         if not (np.isfinite(self.duration) and self.duration > 0.0):
-            raise BadOption("Preintegrated: duration", seen(self.duration), "more than 0 s")
+            raise BadOption("PreintegratedImu: duration", seen(self.duration), "more than 0 s")
         if not abs(np.linalg.norm(self.attitude) - 1.0) <= _TOLERANCE:
-            raise BadShape("Preintegrated: attitude", f"length {np.linalg.norm(self.attitude):g}", "1: qx qy qz qw")
+            raise BadShape("PreintegratedImu: attitude", f"length {np.linalg.norm(self.attitude):g}", "1: qx qy qz qw")
 
     @property
     def numbers(self) -> F64:
@@ -84,12 +86,12 @@ class Preintegrated:
             correlation, least = np.eye(RESIDUAL), 0.0
         if least < 1e-13:
             wanted = "a positive definite one: more samples, or noise of integration, 1e-4 m/√s say"
-            raise BadInformation("Preintegrated: covariance", f"singular (least eigenvalue {least:.2g})", wanted)
+            raise BadInformation("PreintegratedImu: covariance", f"singular (least eigenvalue {least:.2g})", wanted)
         inverse = np.linalg.inv(correlation) / scale / scale[:, None]
         return 0.5 * (inverse + inverse.T)
 
 
-def preintegrate_samples(samples: ArrayLike, noise: ImuNoise, bias: ArrayLike = (0.0,) * BIAS) -> Preintegrated:
+def preintegrate_samples(samples: ArrayLike, noise: ImuNoise, bias: ArrayLike = (0.0,) * BIAS) -> PreintegratedImu:
     """The samples (n, 7) of `cut_samples` as one measurement, integrated at `bias`, the best guess of it.
 
     Good while the bias stays near that: the map corrects what was integrated to first order.
@@ -113,10 +115,10 @@ def preintegrate_samples(samples: ArrayLike, noise: ImuNoise, bias: ArrayLike = 
     covariance[:9, :9] = S
     walk = np.repeat([sensor.gyroscope_walk, sensor.accelerometer_walk], 3)
     covariance[range(9, RESIDUAL), range(9, RESIDUAL)] = walk**2 * T
-    return Preintegrated(T, _quaternion(R), p, v, b, R_b, p_b, v_b, covariance)
+    return PreintegratedImu(T, _quaternion(R), p, v, b, R_b, p_b, v_b, covariance)
 
 
-def preintegrated_factor(of: Moments, made: Preintegrated) -> tuple[str, F64]:
+def preintegrated_factor(of: Moments, made: PreintegratedImu) -> tuple[str, F64]:
     """(kind, measurement) of a factor; see `Draft.imu_preintegrated`."""
     return of.form.name, np.concatenate([made.bias, of.gravity, of.mount, made.numbers])
 

@@ -16,8 +16,7 @@ from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.preintegration import (
     SampleTerms,
     add_sample,
-    make_room,
-    preintegrated_in,
+    nothing_yet,
     scratch_of_sample,
 )
 
@@ -52,9 +51,8 @@ def write_root(form: ImuLayout, z: F64, k: int, out: F64) -> bool:
 @part
 def propagate_noise(form: ImuLayout, z: F64) -> F64:
     """Σ (9, 9) of Δ, at the bias that the measurement names.  (3.46)"""
-    delta, sample, S = preintegrated_in(make_room()), scratch_of_sample(), np.zeros((SIZE, SIZE))
+    delta, sample, S = nothing_yet(), scratch_of_sample(), np.zeros((SIZE, SIZE))
     M, bias = np.empty((4, 3, 3)), z[form.bias_at : form.bias_at + of.BIAS]
-    delta.q[3] = 1.0
     gyroscope, accelerometer, integration = z[of.GYROSCOPE], z[of.ACCELEROMETER], z[of.INTEGRATION]
     for n in range(form.samples):
         k = form.start + of.SAMPLE * n

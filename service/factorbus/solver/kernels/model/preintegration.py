@@ -59,6 +59,14 @@ def make_room() -> F64:
 
 
 @inline_kernel
+def nothing_yet() -> Preintegrated:
+    """Of no samples: arrays of their own, by which a walk over samples takes two thirds of the time of parts of one."""
+    q = np.zeros(4)
+    q[3] = 1.0
+    return Preintegrated(q, np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 6)), np.zeros((3, 6)))
+
+
+@inline_kernel
 def preintegrated_in(room: F64) -> Preintegrated:
     """Δ in an array, or where one begins."""
     k = ROOM_T + 1
@@ -83,17 +91,17 @@ def preintegrate(form: ImuLayout, z: F64, bias: F64, room: F64, jacobians: bool)
     """All samples of the measurement that begins at z[0], at a bias (6,), into `room`.
 
     Where that has them at a bias of the same bits already, they are not looked at.  Without `jacobians` it has to be
-    new, and R_b, p_b and v_b stay zero.
+    new, and R_b, p_b and v_b are zero.
     """
     if has_bits_of(bias, room):
         return
-    room[:] = 0.0
-    delta, scratch, total = preintegrated_in(room), scratch_of_sample(), 0.0
-    delta.q[3] = 1.0
+    delta, scratch, total, kept = nothing_yet(), scratch_of_sample(), 0.0, preintegrated_in(room)
     for n in range(form.samples):
         add_sample(z, form.start + of.SAMPLE * n, bias, delta, scratch, jacobians)
         total += z[form.start + of.SAMPLE * n]
     room[: of.BIAS], room[ROOM_T] = bias, total
+    kept.q[:], kept.p[:], kept.v[:] = delta.q, delta.p, delta.v
+    kept.R_b[:], kept.p_b[:], kept.v_b[:] = delta.R_b, delta.p_b, delta.v_b
 
 
 @inline_kernel
