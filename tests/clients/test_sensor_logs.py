@@ -22,6 +22,7 @@ from factorbus.formats import FormatError
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import InertialWorld, inertial
 from factorbus.solver import Options, Solver
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 DATA = Path(gtsam.__file__).parent / "Data"
 
@@ -57,6 +58,9 @@ def test_the_map_finds_frame_lever_and_mount_within_three_sigma(tmp_path: Path, 
         d2, sigmas = off(solver, symbol(key, 0), kind, truth)
         assert d2 < chdtri(sigmas.size, 0.0027), (key, d2)
         assert np.abs(sigmas).max() < 3.5
+    factored = solver.covariances.factored()
+    turned = CovarianceBlocks(factored).joint(np.array([factored.graph.find(symbol("m", 0))]))[3:, 3:]
+    assert np.sqrt(4 * turned.diagonal()).max() < 0.5 * world.errors.mount[3], "the drive has shown how it is turned"
 
 
 def test_the_same_seed_is_the_same_world_and_a_pose_follows_from_the_samples() -> None:
