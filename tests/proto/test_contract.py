@@ -38,7 +38,7 @@ def test_the_table_of_factors_is_written_from_the_declarations() -> None:
     """`python proto/kinds_table.py` writes it."""
     script = runpy.run_path(str(Path(__file__).parents[2] / "proto" / "kinds_table.py"))
     assert script["found"](CONTRACT) == script["table"]()
-    assert script["found"](CONTRACT, script["_OPERATIONS_HEAD"]) == script["operations"]()
+    assert script["found"](CONTRACT, script["_OPERATIONS_HEAD"], 2) == script["operations"]()
 
 
 def test_every_code_is_explained() -> None:

@@ -13,6 +13,7 @@ from factorbus.client.draft import Draft
 from factorbus.client.features import Features, Growing
 from factorbus.client.filter_state import Factored, FilterState
 from factorbus.client.imu import ImuNoise, Standstill, cut_samples, initial_from_standstill
+from factorbus.client.imu_samples import ImplausibleSamples
 from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror
@@ -33,6 +34,7 @@ __all__ = [
     "Features",
     "FilterState",
     "Growing",
+    "ImplausibleSamples",
     "ImuNoise",
     "KeyCollision",
     "Map",
