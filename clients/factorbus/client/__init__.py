@@ -18,6 +18,7 @@ from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
+from factorbus.client.renaming_kinds import rename_kinds
 from factorbus.client.snapshot import Snapshot
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
@@ -53,4 +54,5 @@ __all__ = [
     "connect",
     "cut_samples",
     "initial_from_standstill",
+    "rename_kinds",
 ]

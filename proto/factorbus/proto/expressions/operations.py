@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeAlias
 
+from factorbus.wording import counted
+
 Type: TypeAlias = str | int
 
 SO3, SE2, SE3 = "so3", "se2", "se3"
@@ -85,7 +87,7 @@ class Operation:
         if first < 0 or count < 1:
             raise Mismatch(f"first is {first} and count is {count}, wanted first from 0 on and count from 1 on")
         if not isinstance(kind, int) or first + count > kind:
-            raise self._mismatch([kind], f"a vector of at least {first + count} numbers")
+            raise self._mismatch([kind], f"a vector of at least {counted(first + count, 'number')}")
         return count
 
     def _joined(self, given: Sequence[Type]) -> Type:
