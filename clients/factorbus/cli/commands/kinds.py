@@ -66,7 +66,7 @@ def command(
         screen.table((called, str(means)) for called, means in found.items())
     else:
         screen.print_note(f"map {name} has factors of no kinds but the service's")
-    for note in notes:
+    for note in [] if as_json else notes:
         click.echo(note)
 
 
