@@ -7,7 +7,7 @@ from pathlib import Path
 
 from factorbus.proto import inertial
 from factorbus.proto.derived_kinds import LETTERS
-from factorbus.proto.expressions.operations import OPERATIONS, Operation
+from factorbus.proto.expressions.operations import ABSENT, LEGEND, OPERATIONS
 from factorbus.proto.kinds import FACTOR_KINDS, LINEAR_NAME, VARIABLE_KINDS, FactorKind
 
 README = Path(__file__).with_name("README.md")
@@ -16,8 +16,8 @@ _HEAD = """\
 |---|---|---|---|
 """
 _OPERATIONS_HEAD = """\
-| operation | gives |
-|---|---|
+| operation | takes → gives | what it gives |
+|---|---|---|
 """
 _FAMILIES = (
     f"| `{LINEAR_NAME}` | any x₁, x₂, … | y of each variable, H of each (rows x its scalars, row by row), b (rows) "
@@ -31,7 +31,7 @@ def main() -> None:
     """Replace the table that is there."""
     text = README.read_text()
     text = text.replace(found(text), table())
-    README.write_text(text.replace(found(text, _OPERATIONS_HEAD), operations()))
+    README.write_text(text.replace(found(text, _OPERATIONS_HEAD, 2), operations()))
 
 
 def table() -> str:
@@ -55,21 +55,17 @@ def _inertial(samples: int) -> str:
 
 
 def operations() -> str:
-    """A row for each operation, and for numbers."""
-    rows = [f"| `{each.name}({_arguments(each)})` | {each.means} |\n" for each in OPERATIONS.values()]
-    return _OPERATIONS_HEAD + "".join(rows)
+    """A row for each operation; how to read it, and what there is not, is below it."""
+    rows = [f"| `{each.signature()}` | {each.forms} | {each.means} |\n" for each in OPERATIONS.values()]
+    return f"{_OPERATIONS_HEAD}{''.join(rows)}\n{LEGEND}\n{ABSENT}\n"
 
 
-def _arguments(operation: Operation) -> str:
-    if operation.arguments < 0:
-        return "a,b,..."
-    return ",".join([*"abc"[: operation.arguments], *(("first", "count") if operation.numbers else ())])
-
-
-def found(text: str, head: str = _HEAD) -> str:
-    """The table with this head in the text of the page: up to the next line that is no row."""
-    start = text.index(head)
-    return text[start : text.index("\n\n", start) + 1]
+def found(text: str, head: str = _HEAD, blocks: int = 1) -> str:
+    """The table with this head in the text of the page: up to the next line that is no row; or more blocks."""
+    start = end = text.index(head)
+    for _ in range(blocks):
+        end = text.index("\n\n", end) + 1
+    return text[start:end]
 
 
 def _ends(kind: FactorKind) -> str:

@@ -98,11 +98,29 @@ def test_without_a_bus(call: Callable[[], object], said: str) -> None:
         (lambda: Draft().heading_se2("x0", math.nan, sigmas=1.0), "not_finite"),
         (lambda: Draft().between_se2("x0", "x1", (1, math.nan, 0), sigmas=(1, 1, 1)), "not_finite"),
         (lambda: Draft().heading_se2("x0", 0.0, information=[math.nan]), "bad_information"),
+        (lambda: Draft().range_se2("x0", "l0", cast("Any", "2.5"), sigmas=1.0), "bad_shape"),
+        (lambda: Draft().se2("x0", cast("Any", ["1", "2", "3"])), "bad_shape"),
+        (lambda: Draft().prior_se2("x0", np.array(["1", "2", "3"]), sigmas=[1] * 3), "bad_shape"),
+        (lambda: Draft().heading_se2("x0", 0.0, sigmas=cast("Any", "1")), "bad_shape"),
         (lambda: Draft().between_se2("x0", "x1", (1, 0, 0), information=np.full((3, 3), np.inf)), "bad_information"),
-        (lambda: Draft().linear(["x0"], [(0, 0, math.nan)], [np.eye(3)], np.zeros(3), sigmas=[1] * 3), "not_finite"),
-        (lambda: Draft().linear(["x0"], [(0, 0, 0)], [np.nan * np.eye(3)], np.zeros(3), sigmas=[1] * 3), "not_finite"),
-        (lambda: Draft().linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.full(3, np.nan), sigmas=[1] * 3), "not_finite"),
-        (lambda: Draft().linear(["x0"], [("a", 0, 0)], [np.eye(3)], np.zeros(3), sigmas=[1] * 3), "bad_shape"),
+        (
+            lambda: Draft().linear(["x0"], [(0, 0, math.nan)], [np.eye(3)], np.zeros(3), kinds=["se2"], sigmas=[1] * 3),
+            "not_finite",
+        ),
+        (
+            lambda: Draft().linear(
+                ["x0"], [(0, 0, 0)], [np.nan * np.eye(3)], np.zeros(3), kinds=["se2"], sigmas=[1] * 3
+            ),
+            "not_finite",
+        ),
+        (
+            lambda: Draft().linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.full(3, np.nan), kinds=["se2"], sigmas=[1] * 3),
+            "not_finite",
+        ),
+        (
+            lambda: Draft().linear(["x0"], [("a", 0, 0)], [np.eye(3)], np.zeros(3), kinds=["se2"], sigmas=[1] * 3),
+            "bad_shape",
+        ),
         (lambda: Draft().variable(cast("Any", []), "x0"), "unknown_kind"),
         (lambda: Changes().weigh([1], math.nan), "not_finite"),
         (lambda: association_question("x1", "landmark_se2", ANY, np.eye(2), None, 0.9), "bad_shape"),

@@ -7,7 +7,7 @@ from naive.dense_factors import residual
 from factorbus.client import Camera, Draft
 from factorbus.client.geodetic import FLATTENING, SEMI_MAJOR_M, ecef, enu
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.problems import BadInformation, BadShape, NotFiniteNumbers, UnknownKind
+from factorbus.proto.problems import BadInformation, BadOption, BadShape, NotFiniteNumbers
 from factorbus.proto.symbols import format_symbol
 
 CAMERA = Camera("pinhole", (500.0, 500.0, 320.0, 240.0))
@@ -76,16 +76,37 @@ def test_what_does_not_go_together_is_refused() -> None:
         Draft().position_se2("x0", (1, 2), twist=(1, 0, 0), sigmas=[1] * 2)
     with pytest.raises(BadShape, match="twist"):
         Draft().landmark_se3("x0", "l0", (1, 2, 3), offset="d0", twist=(1, 0, 0), sigmas=[1] * 3)
-    with pytest.raises(UnknownKind, match="landmark_se2_mount_offset"):
+    with pytest.raises(
+        BadOption, match=r"landmark_se2: the keys of mount= and offset=, .*; wanted one of: mount, offset; or"
+    ):
         Draft().landmark_se2("x0", "l0", (1, 2), mount="m0", **PLANE, sigmas=[1] * 2)
+    with pytest.raises(
+        BadOption, match=r"position_se3: the keys of lever= and offset=, .*one of: lever, frame, frame with l"
+    ):
+        Draft().position_se3("x0", (1, 2, 3), lever="a0", offset="d0", twist=[0] * 6, sigmas=[1] * 3)
+    with pytest.raises(BadOption, match="range_se2: the keys of mount= and bias=, which do not go together"):
+        Draft().range_se2("x0", "l0", 2.0, mount="m0", bias="b0", sigmas=[1])
     with pytest.raises(BadShape, match="a scale and the mount as numbers"):
         Draft().between_se2("x0", "x1", (1, 0, 0), mount=(1, 0, 0), scale="s0", sigmas=[1] * 3)
-    with pytest.raises(UnknownKind, match="point_seen_focal_intrinsics"):
+    with pytest.raises(BadOption, match="point_seen: the keys of focal= and intrinsics=, which do not go together"):
         Draft().point_seen("x0", "l0", CAMERA, (1, 2), focal="c0", intrinsics="c1", sigmas=1)
     with pytest.raises(BadInformation, match="no keyword 'intrinsics'"):
         Draft().landmark_se3("x0", "l0", (1, 2, 3), intrinsics="c0", sigmas=1)  # type: ignore[call-arg]
     with pytest.raises(BadInformation, match="no keyword 'arm'"):
         Draft().position_se2("x0", (1, 2), lever="a0", arm="a1", sigmas=[1] * 2)  # type: ignore[call-arg]
+
+
+def test_sigmas_of_another_number_say_what_the_residual_is() -> None:
+    """What is measured has other numbers: of a GNSS six, with those of the antenna."""
+    for sigmas in (1.0, [1.0] * 6):
+        with pytest.raises(BadShape, match=r"gnss x0: sigmas.*wanted \(3,\): of east, north, up \(metres\)"):
+            Draft().gnss("x0", 46.0, 7.0, 500.0, origin=(46.0, 7.0, 500.0), sigmas=sigmas)
+    with pytest.raises(BadShape, match=r"\(3,\), one for each .*, r = t \+ R λ − \(x y z\), λ on the robot"):
+        Draft().position_se3("x0", (1, 2, 3), sigmas=1.0)
+    with pytest.raises(BadShape, match=r", r = .* as \(x, y, wrap θ\)$"):
+        Draft().between_se2("x0", "x1", (1, 2, 3), sigmas=1.0)
+    with pytest.raises(BadShape, match=r"qw ≥ 0; of rotations in radians about x y z$"):
+        Draft().between_se3("x0", "x1", (1, 2, 3, 0, 0, 0, 1), sigmas=1.0)
 
 
 def test_a_known_place_is_where_others_have_computed_it() -> None:

@@ -1,7 +1,9 @@
 """A front end's IMU: samples cut at the poses, what standing still tells, what a draft makes of it, and merging."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,14 @@ from naive.random_imu import GRAVITY_KEY, MOUNT_KEY, keys_of, random_ends, rando
 from naive.random_imu import NOISE as NOISE_NUMBERS
 from scipy.spatial.transform import Rotation
 
-from factorbus.client import Draft, ImuNoise, cut_samples, initial_from_standstill, preintegrate_samples
+from factorbus.client import (
+    Draft,
+    ImplausibleSamples,
+    ImuNoise,
+    cut_samples,
+    initial_from_standstill,
+    preintegrate_samples,
+)
 from factorbus.client.key_numbers import key_number
 from factorbus.client.merging import AbsoluteFactors, fit_into
 from factorbus.proto import codec
@@ -32,12 +41,56 @@ def test_samples_hold_until_the_next_and_are_cut_at_the_poses() -> None:
     found = cut_samples(times, w, a, 0.25, 0.55)
     np.testing.assert_allclose(found[:, 0], [0.05, 0.1, 0.1, 0.05], atol=1e-12)
     np.testing.assert_array_equal(found[:, 1:4], w[2:6])
-    assert cut_samples(times, w, a, 0.9, 2.0)[:, 0] == pytest.approx([1.1])
+    assert cut_samples(times, w, a, 0.9, 1.8)[:, 0] == pytest.approx([0.9])
+    assert cut_samples(times, w, a, 0.9, 2.0, longest_s=1.2)[:, 0] == pytest.approx([1.1])
+    assert cut_samples([0.9], w[:1], a[:1], 0.9, 2.0)[:, 0] == pytest.approx([1.1])
     whole = [cut_samples(times, w, a, k / 20, (k + 1) / 20)[:, 0].sum() for k in range(10)]
     np.testing.assert_allclose(whole, 0.05)
 
 
 MADE = preintegrate_samples(SAMPLES, NOISE)
+def test_samples_that_were_lost_are_not_bridged() -> None:
+    """At 100 Hz, with none for 4 s in the middle, and none at the end."""
+    times = np.concatenate([np.arange(0, 100), np.arange(500, 600)]) / 100
+    three = np.ones((times.size, 3))
+    assert len(cut_samples(times, three, three, 0.5, 0.99)) == 49
+    assert len(cut_samples(times, three, three, 5.0, 5.5)) == 50
+    for begin, end in ((0.9, 5.1), (0.9, 1.1), (2.0, 2.1), (4.9, 5.1)):
+        with pytest.raises(
+            BadOption, match=r"no sample for 4.01 s after 0.99 s; wanted one every 0.1 s \(longest_s, 10 times"
+        ):
+            cut_samples(times, three, three, begin, end)
+    with pytest.raises(BadOption, match=r"no sample for 0.31 s after 5.99 s"):
+        cut_samples(times, three, three, 5.5, 6.3)
+    assert cut_samples(times, three, three, 0.9, 5.1, longest_s=5.0)[:, 0].sum() == pytest.approx(4.2)
+    with pytest.raises(BadOption, match=r"no sample for 0.01 s .* wanted one every 0.005 s \(longest_s\)"):
+        cut_samples(times, three, three, 0.5, 0.99, longest_s=0.005)
+    for wrong in (0.0, float("nan")):
+        with pytest.raises(BadOption, match="longest_s"):
+            cut_samples(times, three, three, 0.5, 0.99, longest_s=wrong)
+
+
+@pytest.mark.parametrize(
+    ("factors", "said"),
+    [
+        ([1, 1, 1, 1, *[1 / 9.80665] * 3], "median of |accelerometer| is about 1 m/s²: is it in g? Multiply by 9.8"),
+        ([1, 1, 1, 1, *[1000.0] * 3], "is it in mm/s²"),
+        ([1, 1000, 1, 1, 1, 1, 1], "gyroscopes say 1e+02 rad/s, more than any measures: are they in degrees"),
+    ],
+)
+def test_samples_in_other_units_are_warned_of(factors: list[float], said: str) -> None:
+    with pytest.warns(ImplausibleSamples, match=re.escape(said)) as warned:
+        Draft().imu(A, B, SAMPLES * factors, noise=NOISE)
+    assert [Path(each.filename).name for each in warned] == ["test_imu.py"]
+
+
+@pytest.mark.filterwarnings("error")
+def test_free_fall_and_a_hard_turn_are_not() -> None:
+    Draft().imu(A, B, SAMPLES * [1, 1, 1, 1, 0.01, 0, 0.01], noise=NOISE)
+    Draft().imu(A, B, SAMPLES * [1, 300, 1, 1, 10, 1, 10], noise=NOISE)
+    Draft().imu(A, B, SAMPLES * 0.1, noise=NOISE, gravity=(0, 0, 0))
+
+
 ONES, SHAKEN = np.ones((3, 3)), np.array([[0.0] * 7, [0, 1, 1, 1, 0, 0, 0]])
 REFUSED: dict[str, tuple[Callable[[], object], type[Problem], str]] = {
     "a sample before": (lambda: cut_samples([1, 2, 3], ONES, ONES, 0.5, 2), BadOption, "at begin_s"),
@@ -68,6 +121,24 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Problem], str]] = {
     "a small covariance": (lambda: replace(MADE, covariance=np.eye(9)), BadShape, r"covariance: .*\(15, 15\)"),
     "bias": (lambda: Draft().imu(A, B, SAMPLES, noise=NOISE, bias=(0, 0, 0)), BadShape, "bias"),
     "moves": (lambda: initial_from_standstill(SAMPLES + SHAKEN), BadOption, "at rest"),
+    "in g": (lambda: initial_from_standstill(SAMPLES / [1, 1, 1, 1, 9.8, 9.8, 9.8]), BadOption, "is it in g. Multiply"),
+    "a NaN sample": (
+        lambda: Draft().imu(A, B, np.where(np.arange(14).reshape(2, 7) == 12, np.nan, SAMPLES), noise=NOISE),
+        NotFiniteNumbers,
+        "nan in sample 1, accelerometer y;",
+    ),
+    "NaN samples": (
+        lambda: initial_from_standstill(SAMPLES * [[1, np.inf, 1, 1, 1, 1, 1], [1, 1, 1, 1, 1, np.nan, 1]]),
+        NotFiniteNumbers,
+        "inf in sample 0, gyroscope x, and in 1 more",
+    ),
+    "a NaN of many": (
+        lambda: cut_samples(
+            np.arange(99), np.where(np.arange(99 * 3).reshape(99, 3) == 200, np.nan, 1.0), np.ones((99, 3)), 1, 2
+        ),
+        NotFiniteNumbers,
+        r"gyroscope: .*nan at \[66, 2\], of shape \(99, 3\)",
+    ),
     "falls": (lambda: initial_from_standstill(SAMPLES * [1, 1, 1, 1, 1, 1, 0.1]), BadOption, "9.80665 ± 1"),
     "one sample": (lambda: initial_from_standstill(SAMPLES[:1]), BadShape, "2 or more"),
     "neither": (lambda: Draft().vector("v0"), BadOption, "neither a value nor a size"),

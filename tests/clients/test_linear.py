@@ -13,7 +13,7 @@ from factorbus.client import Draft
 from factorbus.proto import codec
 from factorbus.proto.kinds import MOST_JOINED
 from factorbus.proto.messages import Batch, Change, Insert
-from factorbus.proto.problems import Problem
+from factorbus.proto.problems import BadShape, Problem
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
 from factorbus.solver.changing import with_changes
@@ -228,12 +228,15 @@ def test_a_chain_of_them_is_undone_and_slides(mode: str) -> None:
 def test_it_is_one_factor_as_it_was_said() -> None:
     pose, point = (0, 0, 0, 0, 0, 0, 1), (1, 2, 3)
     H, b = [np.ones((2, 3)), np.ones((2, 6))], (0.5, 0.25)
-    draft = Draft().linear(["l1", "x1"], [point, pose], H, b, sigmas=(1, 2), loss=("huber", 1.5))
+    draft = Draft().linear(
+        ["l1", "x1"], [point, pose], H, b, kinds=["point3", "se3"], sigmas=(1, 2), loss=("huber", 1.5)
+    )
     (group,) = draft.batch().factors
     assert (group.kind, group.loss) == ("linear_2_point3_se3", "huber")
     assert group.keys.tolist() == [[symbol("l", 1), symbol("x", 1)]]
     np.testing.assert_array_equal(full(group.information[0]), np.diag([1.0, 0.25]))
-    (group,) = Draft().linear(["x1"], [(1, 2, 0.5)], [np.eye(3)], np.zeros(3), sigmas=(1, 1, 2)).batch().factors
+    draft = Draft().se2("x1").linear(["x1"], [(1, 2, 0.5)], [np.eye(3)], np.zeros(3), sigmas=(1, 1, 2))
+    (group,) = draft.batch().factors
     assert group.kind == "linear_3_se2"
     (group,) = (
         Draft().linear(["v1"], [point], [np.eye(3)], np.zeros(3), sigmas=(1, 1, 2), kinds=["point3"]).batch().factors
@@ -243,16 +246,34 @@ def test_it_is_one_factor_as_it_was_said() -> None:
 
 def test_the_kinds_of_what_is_in_the_draft_need_not_be_said() -> None:
     draft = Draft().se3("x1", (0, 0, 0, 0, 0, 0, 1)).vector("v1", (1, 0, 0)).vector("s1", [1.5])
-    H = [np.ones((2, 6)), np.ones((2, 3)), np.ones((2, 1)), np.ones((2, 3))]
-    y = [(0, 0, 0, 0, 0, 0, 1), (1, 0, 0), (1.5,), (4, 5, 6)]
-    (group,) = draft.linear(["x1", "v1", "s1", "l1"], y, H, (0, 0), sigmas=(1, 1)).batch().factors
-    assert group.kind == "linear_2_se3_vector3_vector1_point3"
-    with pytest.raises(Problem) as refused:
-        Draft().linear(["s1"], [(1.5,)], [np.eye(1)], (0,), sigmas=(1,))
-    assert refused.value.code == "bad_shape"
-    assert "kinds=" in str(refused.value)
+    H = [np.ones((2, 6)), np.ones((2, 3)), np.ones((2, 1)), np.ones((2, 4))]
+    y = [(0, 0, 0, 0, 0, 0, 1), (1, 0, 0), (1.5,), (4, 5, 6, 7)]
+    (group,) = draft.linear(["x1", "v1", "s1", "w1"], y, H, (0, 0), sigmas=(1, 1)).batch().factors
+    assert group.kind == "linear_2_se3_vector3_vector1_vector4"
     with pytest.raises(Problem):
         Draft().vector("v1", np.zeros(10))
+
+
+ROW7 = (0.0, 0, 0, 0, 0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "columns", "kind"),
+    [*((n, n, f"vector{n}") for n in (1, 4, 5, 7, 8, 9)), (7, 6, "se3"), (2, 2, ""), (3, 3, ""), (6, 6, "")],
+)
+def test_of_an_earlier_insert_a_kind_is_only_taken_that_can_be_no_other(numbers: int, columns: int, kind: str) -> None:
+    """A prior on a bias was sent as an idp, one on a velocity as an se2."""
+    said = (["b5"], [ROW7[-numbers:] if numbers < 8 else np.zeros(numbers)], [np.ones((2, columns))], (0, 0))
+    if kind:
+        (group,) = Draft().linear(*said, sigmas=(1, 1)).batch().factors
+        assert group.kind == f"linear_2_{kind}"
+        return
+    with pytest.raises(
+        BadShape, match=rf"value of b5, which is not.* or vector{numbers}; wanted kinds=.*vector{numbers}"
+    ):
+        Draft().linear(*said, sigmas=(1, 1))
+    (group,) = Draft().linear(*said, sigmas=(1, 1), kinds=[f"vector{numbers}"]).batch().factors
+    assert group.kind == f"linear_2_vector{numbers}"
 
 
 @pytest.mark.parametrize(
@@ -278,6 +299,7 @@ def test_what_is_wrong_is_refused_before_it_is_sent(change: dict, code: str) -> 
         "jacobians": [np.ones((6, 6)), np.ones((6, 3))],
         "residual": np.zeros(6),
         "information": np.eye(6),
+        "kinds": ["se3", "point3"],
     }
     Draft().linear(**said)
     with pytest.raises(Problem) as refused:

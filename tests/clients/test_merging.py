@@ -276,7 +276,8 @@ def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
     keys = np.array([parse_symbol(f"x{i}") for i in range(3)])
     Lambda = np.kron(3.01 * np.eye(3) - np.ones((3, 3)), np.diag([100.0, 100.0, 400.0]))
     H = np.split(np.linalg.cholesky(Lambda).T, 3, axis=1)
-    sent = Draft().linear(["x0", "x1", "x2"], [np.zeros(3)] * 3, H, np.zeros(9), sigmas=[1.0] * 9).batch().factors
+    ends, known = ["x0", "x1", "x2"], {"kinds": ["se2"] * 3, "sigmas": [1.0] * 9}
+    sent = Draft().linear(ends, [np.zeros(3)] * 3, H, np.zeros(9), **known).batch().factors
     assert not are_relative(sent[0], NO_ROLES).any()
     batch = there().batch
     other = MapGraph(

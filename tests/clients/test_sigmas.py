@@ -122,7 +122,7 @@ def test_an_unknown_keyword_is_refused_by_name_with_what_was_meant(wrong: dict, 
     for add in (
         lambda **how: draft.between_se2("x0", "x1", (1, 0, 0), **how),
         lambda **how: draft.between_se2("x0", "x1", (1, 0, 0), mount=(1, 0, 0), **how),
-        lambda **how: draft.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), **how),
+        lambda **how: draft.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), kinds=["se2"], **how),
     ):
         for rest in ({}, {"sigmas": (1, 1, 1)}):
             with pytest.raises(BadInformation, match=f"no keyword '{name}'") as refused:
@@ -246,7 +246,7 @@ EVERY_METHOD = {
     "between_sim3": lambda d, **how: d.between_sim3("s0", "s1", (*IDENTITY, 1), **how),
     "landmark_sim3": lambda d, **how: d.landmark_sim3("s0", "l0", (1, 0, 0), **how),
     "position_sim3": lambda d, **how: d.position_sim3("s0", (1, 0, 0), **how),
-    "linear": lambda d, **how: d.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), **how),
+    "linear": lambda d, **how: d.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), kinds=["se2"], **how),
     "idp_seen": lambda d, **how: d.idp_seen("x0", "f0", CAMERA, (1, 2), **how),
     "point_seen": lambda d, **how: d.point_seen("x0", "l0", CAMERA, (1, 2), **how),
     "factor": lambda d, **how: d.factor("prior_se2", "x0", (0, 0, 0), **how),

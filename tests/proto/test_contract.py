@@ -10,6 +10,7 @@ import pytest
 
 from factorbus.client import link
 from factorbus.proto import keys, messages, problems
+from factorbus.proto.expressions.operations import OPERATIONS
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.protocol import known
 from factorbus.proto.symbols import symbol
@@ -38,7 +39,15 @@ def test_the_table_of_factors_is_written_from_the_declarations() -> None:
     """`python proto/kinds_table.py` writes it."""
     script = runpy.run_path(str(Path(__file__).parents[2] / "proto" / "kinds_table.py"))
     assert script["found"](CONTRACT) == script["table"]()
-    assert script["found"](CONTRACT, script["_OPERATIONS_HEAD"]) == script["operations"]()
+    assert script["found"](CONTRACT, script["_OPERATIONS_HEAD"], 2) == script["operations"]()
+
+
+def test_the_tutorial_lists_the_operations_with_what_they_take() -> None:
+    tutorial = (Path(__file__).parents[2] / "docs" / "tutorials" / "own-factor.md").read_text(encoding="utf-8")
+    rows = [" ".join(line.split()) for line in tutorial.splitlines()]
+    for each in OPERATIONS.values():
+        wanted = f"{each.signature()} {each.forms}: "
+        assert sum(row.startswith(wanted) for row in rows) == 1, wanted
 
 
 def test_every_code_is_explained() -> None:

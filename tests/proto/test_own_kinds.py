@@ -1,16 +1,21 @@
 """Formulas: what they mean, how they are written, and what is wrong with those that mean nothing."""
 
+import itertools
+import math
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from naive.own_formulas import OWN
 from naive.random_formulas import random_formula
 
 from factorbus.client import Draft
-from factorbus.client.expressions import SE2, SE3, Point3, Vector, factor, norm, select
+from factorbus.client.expressions import SE2, SE3, Point2, Point3, Vector, factor, norm, select
 from factorbus.proto import codec
 from factorbus.proto.expressions.declaration import BadExpression
 from factorbus.proto.expressions.formula import MOST_CHARACTERS, read_formula, write_formula
 from factorbus.proto.expressions.frames import moving_ends
+from factorbus.proto.expressions.operations import OPERATIONS, Mismatch, Type
 from factorbus.proto.kinds import FACTOR_KINDS, FactorKind, own_kind
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import BadShape, Problem, UnknownKind
@@ -74,7 +79,18 @@ def test_texts_of_one_expression_are_one_kind() -> None:
         ("f(a:se2,z:1)=add(position(a),[1,z])", "wanted a number"),
         ("f(a:se2,z:1)=_1=position(a);_1=z;_1", "wanted a name that is not used yet in place of _1"),
         ("f(a:se2,z:1)=_1;_1=position(a)", "wanted a variable, a number"),
-        ("F(a:se2,z:1)=position(a)", "wanted more of a formula"),
+        ("F(a:se2,z:1)=position(a)", "⟨here⟩ F.*wanted small letters, digits, _ and"),
+        ("f(A:se2,z:1)=position(A)", "⟨here⟩ A.*wanted small letters, digits, _ and"),
+        ("f(_1:se2,z:1)=position(_1)", "wanted a name, which begins with a small letter"),
+        ("_f(a:se2,z:1)=position(a)", "wanted a name, which begins with a small letter"),
+        ("f(a:se2,z:1)=subtract(heading(a),１)", "⟨here⟩ １.*wanted small letters, digits, _ and"),
+        ("f(a:se2,z:1)=subtract(heading(a),١)", "⟨here⟩ ١.*wanted small letters, digits, _ and"),
+        ("f(a:se2,z:1)=\u2003heading(a)", "wanted small letters, digits, _ and"),
+        ("f(a:se2,z:1)=headng(a)", "did you mean 'heading'"),
+        ("f(anchor:se2,z:1)=heading(anchr)", "did you mean 'anchor'"),
+        ("f(a:pont2,z:1)=norm(a)", "did you mean 'point2'"),
+        ("f(a:vector3,z:1)=part(a,-1,1)", "first is -1 and count is 1, wanted first from 0 on and count from 1 on"),
+        ("f(a:vector3,z:1)=part(a,0,0)", "first is 0 and count is 0, wanted first from 0 on and count from 1 on"),
         ("prior_se2(a:se2,z:se2)=log(a)", "prior_se2 is a kind that there is already"),
         ("linear_3(a:se2,z:se2)=log(a)", "linear_3 is a kind that there is already"),
         (f"{'n' * 64}(a:se2,z:1)=position(a)", "wanted up to 63 small letters"),
@@ -202,8 +218,144 @@ def test_python_cannot_decide_by_an_expression() -> None:
     def f(a: SE2, z: Vector[1]):
         return a.position if a.heading else z
 
-    with pytest.raises(TypeError, match="use select"):
+    with pytest.raises(BadExpression, match=r"no value while it is written; wanted select\(a - b, x, y\)"):
         factor(f)
+
+
+# What is written first, and the way to write it that the refusal has; a is an se2, p a point2, v a vector3.
+FIRST_TRIED = {
+    "a.heading > 0": r">: .*wanted select",
+    "0 > a.heading": r"<: .*wanted select",
+    "a.heading >= 0": r">=: .*wanted select",
+    "a.heading <= 0": r"<=: .*wanted select",
+    "a.heading == 0": r"==: .*wanted select",
+    "a.heading != 0": r"!=: .*wanted select",
+    "max(a.heading, 0)": r"wanted select",
+    "norm(p) ** 2": r"\*\*: .*wanted a \* a, sqrt\(a\), or dot",
+    "2 ** norm(p)": r"\*\*: .*no power of a number",
+    "abs(norm(p))": r"abs: .*wanted norm\(a\)",
+    "p @ p": r"@: .*wanted dot\(a, b\) of vectors",
+    "np.eye(2) @ p": r"matmul: .*wanted dot\(a, b\) of vectors",
+    "a.heading % 6.28": r"%: .*wanted wrap",
+    "a.heading // 2": r"//: .*wanted a / b",
+    "round(a.heading)": r"round: ",
+    "int(a.heading)": r"int: ",
+    "[1, 2][a.heading]": r"as an index .*wanted a fixed number",
+    "math.sin(a.heading)": r"function of math: .*wanted sin, cos",
+    "np.sin(a.heading)": r"np\.sin: .*wanted sin\(a\)",
+    "np.arctan2(p[1], p[0])": r"np\.arctan2: .*wanted atan2\(a, b\)",
+    "np.log(norm(p))": r"np\.log: .*no such function.*no power, logarithm",
+    "np.linalg.norm(p)": r"np\.norm: .*wanted norm\(a\)",
+    "np.dot(p, p)": r"np\.dot: .*wanted dot",
+    "np.hypot(p[0], p[1])": r"np\.hypot: .*wanted norm\(vector",
+    "np.array([p[0], p[1]])": r"as an array of NumPy: .*vector",
+    "np.cosh(a.heading)": r"np\.cosh: .*did you mean 'cos'",
+    "np.ones(2) > p": r"np\.\w+: .*wanted select",
+    "a.theta": r"se2 has no \.theta; wanted \.heading",
+    "a.x": r"has no \.x; wanted \.position\[0\]",
+    "v.z": r"has no \.z; wanted .*\[2\] of a vector",
+    "a.translation": r"wanted \.position",
+    "a.norm()": r"wanted norm\(a\), a function",
+    "a.T": r"wanted \.inverse\(\)",
+    "a.heding": r"wanted \.position, .*did you mean '\.heading'",
+    "v.heading": r"heading: got a vector of 3, wanted a pose in the plane",
+    "a.position()": r"\(\): .*without parentheses",
+    "norm(p) * '3'": r"got '3'; wanted an expression, a number",
+    "'3' * norm(p)": r"got '3'; wanted an expression, a number",
+    "p * ['3', '4']": r"got \['3', '4'\]; wanted",
+    "norm([p[0], p[1]])": r"norm: got a list with expressions.*wanted vector\(a, b\)",
+}
+
+
+@pytest.mark.parametrize("body", FIRST_TRIED)
+def test_what_is_tried_first_says_how_it_is_written(body: str) -> None:
+    names = {"SE2": SE2, "Point2": Point2, "Vector": Vector, "norm": norm, "np": np, "math": math}
+    exec(f"def f(a: SE2, p: Point2, v: Vector[3], z: Vector[1]):\n    return {body}\n", names)
+    with pytest.raises(BadExpression, match=FIRST_TRIED[body]):
+        factor(names["f"])
+
+
+def test_numpy_has_numbers_beside_expressions() -> None:
+    @factor
+    def f(p: Point2, z: Vector[2]):
+        assert not hasattr(p, "foot")
+        return np.array([1.0, 2.0]) * p + np.float64(3.0) * p - np.ones(2) - z
+
+    @factor
+    def g(p: Point2, z: Vector[2]):
+        return [1.0, 2.0] * p + 3.0 * +p - [1.0, 1.0] - z
+
+    assert f.name.removeprefix("f") == g.name.removeprefix("g")
+
+
+def plain(a: SE2, z: Vector[1]):
+    return a.heading - z
+
+
+@pytest.mark.parametrize(
+    ("made", "why"),
+    [
+        (lambda: factor(), "factor: got nothing; wanted @factor without parentheses"),
+        (lambda: factor(name="g"), "factor: got name; wanted @factor without parentheses"),
+        (lambda: factor(plain, name="g"), "factor: got name; .*its name is that of the kind"),
+        (lambda: factor("f(a:se2,z:1)=heading(a)"), "factor: got 'f"),  # type: ignore[arg-type]
+    ],
+)
+def test_the_decorator_stands_alone(made: Callable[[], object], why: str) -> None:
+    with pytest.raises(BadExpression, match=why):
+        made()
+
+
+def test_a_parameter_is_a_variable_and_has_no_default() -> None:
+    def three(a: SE2, z: Vector[1] = 3):  # type: ignore[assignment]
+        return a.heading - z
+
+    def many(*a: SE2, z: Vector[1]):
+        return a[0].heading - z
+
+    with pytest.raises(BadExpression, match="three: z has the default 3, which no factor would have"):
+        factor(three)
+    with pytest.raises(BadExpression, match=r"many: \*a.*one parameter for each variable"):
+        factor(many)
+
+
+def test_an_own_kind_cannot_be_found_by_its_short_name() -> None:
+    for kind in ("clock", "clokc", "range_bias"):
+        with pytest.raises(
+            UnknownKind, match="or a formula; one of your own is given as what @factor made of its function"
+        ):
+            Draft().factor(kind, ("x1",), [1.0], sigmas=[1.0])
+    with pytest.raises(UnknownKind, match="did you mean 'range_se2'"):
+        Draft().factor("rnage_se2", ("x1", "l1"), [1.0], sigmas=[1.0])
+    with pytest.raises(UnknownKind) as refused:
+        Draft().factor("f(a:se2,z:1)=headng(a)", ("x1",), [1.0], sigmas=[1.0])
+    assert str(refused.value).count("did you mean") == 1
+
+
+TYPES: tuple[Type, ...] = ("so3", "se2", "se3", 1, 2, 3, 4, 6, 64)
+
+
+def test_the_table_of_signatures_has_what_each_operation_takes() -> None:
+    """By a reading of the table that is not the checker's: every case of up to three arguments."""
+    for each in OPERATIONS.values():
+        if each.name in ("part", "vector"):
+            continue
+        table = {}
+        for form in each.forms.split("; "):
+            takes, gives = form.split(" → ")
+            for n, group in itertools.product((1, 2, 3, 4, 6, 64), ("so3", "se2", "se3")):
+                meant = {"n": n, "G": group} | {str(k): k for k in range(1, 7)}
+                table[tuple(meant.get(word, word) for word in takes.split(", "))] = meant.get(gives, gives)
+        assert each.signature().count(",") == each.arguments - 1
+        for given in itertools.product(TYPES, repeat=each.arguments):
+            if given in table:
+                assert each.gives(given, ()) == table[given]
+            else:
+                with pytest.raises(Mismatch, match=r"got .*, wanted "):
+                    each.gives(given, ())
+    with pytest.raises(Mismatch, match="at most 64 numbers together"):
+        OPERATIONS["vector"].gives((64, 1), ())
+    assert OPERATIONS["part"].gives((3,), (1, 2)) == 2
 
 
 def test_an_annotation_that_is_no_kind_says_so() -> None:

@@ -12,7 +12,18 @@ import numpy as np
 import pytest
 from processes import Process
 
-from factorbus.client import AbsoluteFactors, Changes, Draft, KeyCollision, Map, NoAnchor, Refused, aio, connect
+from factorbus.client import (
+    AbsoluteFactors,
+    CannotMerge,
+    Changes,
+    Draft,
+    KeyCollision,
+    Map,
+    NoAnchor,
+    Refused,
+    aio,
+    connect,
+)
 from factorbus.client.merging import fit_into
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import format_symbol, symbol
@@ -185,6 +196,38 @@ def test_what_is_refused_changes_nothing(endpoint: str) -> None:
             ours.insert(good.batch)
         assert refused.value.code == "duplicate_variable"
         assert ours.stats()["revision"] == 3
+
+
+def test_one_name_for_two_kinds_is_renamed_and_vectors_alone_are_inserted(endpoint: str) -> None:
+    def wheel(name: str, factor: float) -> str:
+        return f"{name}(a:se2,b:se2,z:1)=subtract(multiply(norm(subtract(position(a),position(b))),{factor}),z)"
+
+    with connect(endpoint, client="robots", timeout_s=60) as bus:
+        ours, theirs, vectors = (bus.map(name) for name in ("wheels-ours", "wheels-theirs", "wheels-vectors"))
+        for joined, factor in ((ours, 2.5), (theirs, 3.5)):
+            draft = Draft().se2("x0", (0, 0, 0), fixed=True).se2("x1").between_se2("x0", "x1", (1, 0, 0), sigmas=SIGMAS)
+            joined.insert(draft)
+            joined.insert(Draft().factor(wheel("wheel", factor), ("x0", "x1"), [factor], sigmas=[0.1]))
+        how = {"letters": {"x": "y"}, "anchors": Draft().between_se2("x1", "y0", (1, 0, 0), sigmas=SIGMAS)}
+        with pytest.raises(
+            Refused, match=r"nothing was merged\. Give .*rename_kinds\(other\.graph\(\), {'wheel'"
+        ) as refused:
+            ours.merge(theirs, **how)
+        assert refused.value.code == "kind_taken"
+        line = ("--letter", "x=y", "--anchor", "x1", "y0", "1,0,0", "--sigmas", "0.1,0.1,0.05", "--connect", endpoint)
+        said = command("change", "merge", "wheels-ours", "wheels-theirs", *line, code=5)
+        assert "nothing was merged. Give the kind of OTHER another name, such as --kind wheel=wheel_2" in said
+        told = json.loads(
+            command("change", "merge", "wheels-ours", "wheels-theirs", *line, "--kind", "wheel=wheel_2", "--json")
+        )
+        assert told["chi2"] == pytest.approx(0, abs=1e-9)
+        kinds = {group.kind for group in ours.graph().batch.factors}
+        assert kinds == {"between_se2", wheel("wheel", 2.5), wheel("wheel_2", 3.5)}
+        vectors.insert(Draft().vector("b0", (1, 2)).linear(["b0"], [(1, 2)], [np.eye(2)], (0, 0), sigmas=[1, 1]))
+        with pytest.raises(CannotMerge, match=r"insert its graph\(\)\.batch"):
+            ours.merge(vectors, **how)
+        ours.insert(vectors.graph().batch)
+        assert ours.graph().batch.factor_count == 6
 
 
 def test_maps_of_one_frame_keep_what_they_know_of_it(endpoint: str) -> None:

@@ -13,11 +13,13 @@ from factorbus.client.draft import Draft
 from factorbus.client.features import Features, Growing
 from factorbus.client.filter_state import Factored, FilterState
 from factorbus.client.imu import ImuNoise, Standstill, cut_samples, initial_from_standstill
+from factorbus.client.imu_samples import ImplausibleSamples
 from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
 from factorbus.client.preintegration import PreintegratedImu, preintegrate_samples
+from factorbus.client.renaming_kinds import rename_kinds
 from factorbus.client.snapshot import Snapshot
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
@@ -34,6 +36,7 @@ __all__ = [
     "Features",
     "FilterState",
     "Growing",
+    "ImplausibleSamples",
     "ImuNoise",
     "KeyCollision",
     "Map",
@@ -54,4 +57,5 @@ __all__ = [
     "cut_samples",
     "initial_from_standstill",
     "preintegrate_samples",
+    "rename_kinds",
 ]

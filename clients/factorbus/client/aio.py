@@ -33,6 +33,7 @@ from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
 from factorbus.client.questions import logged
+from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.asking import Repaired
 from factorbus.proto.camera import Camera
@@ -189,7 +190,8 @@ class Map:
             await self.ask_estimate(timeout_s=timeout_s), other,
             anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute,
         )  # fmt: skip
-        return Merged(await self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
+        with saying_how_to_rename():
+            return Merged(await self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
 
     async def send(
         self,

@@ -13,6 +13,7 @@ from factorbus.proto.nearest import nearest
 from factorbus.proto.problems import BadOption, BadShape, NotFiniteNumbers
 
 T = TypeVar("T")
+_FEW = 12  # numbers that are shown whole
 _PLAIN = (str, bytes, int, float, complex, list, tuple, dict, type(None))
 
 
@@ -41,17 +42,21 @@ def checked_seconds(what: str, given: Any, usual: float) -> float:
 
 
 def as_numbers(what: str, given: Any, wanted: str = "numbers") -> F64:
-    """`given` as an array of floats, of any shape.  Raises BadShape."""
+    """`given` as an array of floats, of any shape; text is none, though NumPy would read it.  Raises BadShape."""
     try:
-        return np.array(given, np.float64)
+        numbers = np.array(given, np.float64)
+        is_text = not isinstance(given, (float, int)) and np.asarray(given).dtype.kind in "US"
     except (TypeError, ValueError):
         raise BadShape(what, repr(given)[:80], wanted) from None
+    if is_text:
+        raise BadShape(what, repr(given)[:80], f"{wanted}, not text")
+    return numbers
 
 
 def all_finite(what: str, numbers: F64) -> F64:
     """`numbers`, if none of them is a NaN or an infinity.  Raises NotFiniteNumbers."""
     if not np.isfinite(numbers).all():
-        raise NotFiniteNumbers(what, repr(numbers.tolist())[:80])
+        raise NotFiniteNumbers(what, _first_not_finite(numbers))
     return numbers
 
 
@@ -76,6 +81,16 @@ def checked_keywords(what: str, given: Iterable[str], wanted: Sequence[str]) -> 
     for name in given:
         if name not in wanted:
             raise BadOption(what, f"there is no keyword {name!r}", f"{', '.join(wanted)}{nearest(name, wanted)}")
+
+
+def _first_not_finite(numbers: F64) -> str:
+    """All of a few numbers; of many where the first one is that is none."""
+    if numbers.size <= _FEW:
+        return repr(numbers.tolist())[:80]
+    bad = np.argwhere(~np.isfinite(numbers))
+    more = f", the first of {len(bad)}" if len(bad) > 1 else ""
+    at = ", ".join(map(str, bad[0].tolist()))
+    return f"{numbers[tuple(bad[0])]} at [{at}]{more}, of shape {numbers.shape}"
 
 
 def seen(given: Any) -> str:

@@ -161,8 +161,7 @@ def check_names(where: str, certainty: Mapping[str, object], of: type = Certaint
 def _from_sigmas(where: str, dim: int, sigmas: F64, kind: str) -> F64:
     if sigmas.shape != (dim,):
         seen = "one number" if sigmas.shape == (1,) else f"shape {sigmas.shape}"
-        rows = f": {FACTOR_KINDS[kind].measured}" if kind in FACTOR_KINDS and dim > 1 else ""
-        raise BadShape(f"{where}: sigmas", seen, f"({dim},), one for each number of the residual{rows}")
+        raise BadShape(f"{where}: sigmas", seen, f"({dim},), one for each number of the residual{_rows(kind, dim)}")
     if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
         raise BadInformation(f"{where}: sigmas", sigmas.tolist(), "positive finite numbers")
     if kind in FACTOR_KINDS and FACTOR_KINDS[kind].half_angles:
@@ -174,6 +173,15 @@ def _from_sigmas(where: str, dim: int, sigmas: F64, kind: str) -> F64:
     if not (np.isfinite(information).all() and (information > 0).all()):
         raise BadInformation(f"{where}: sigmas", sigmas.tolist(), "numbers whose squares a double has, 1e-150 to 1e150")
     return np.diag(information)[np.triu_indices(dim)]
+
+
+def _rows(kind: str, dim: int) -> str:
+    """What the numbers of a residual are, where a kind has that in a table."""
+    known = FACTOR_KINDS.get(kind)
+    if known is None or known.own or known.is_linear or dim == 1:
+        return ""
+    turns = "; of rotations in radians about x y z" if known.half_angles else ""
+    return f", r = {known.residual}{turns}"
 
 
 def _from_matrix(where: str, dim: int, matrix: F64) -> F64:

@@ -263,7 +263,8 @@ class Draft:
         bias (vector6): ("x0", "v0", "b0"), ("x1", "v1", "b1").  Those of the second without a value get it from this.
 
         samples (n, 7), n up to 2000: duration (s), gyroscopes (rad/s), accelerometers (m/s²), as it measured them, from
-        pose to pose (`cut_samples`); the service integrates them at every linearization.
+        pose to pose (`cut_samples`); the service integrates them at every linearization.  At rest they read +9.8 along
+        the axis that points up (specific force, not gravity).  ImplausibleSamples warns of g and of degrees.
         gravity: in the map, m/s², or the key of a vector3 (how long: the kind `length_vector3`).
         bias: where the noise of the samples is propagated, the best guess of it.
         mount: the IMU's pose on the robot, x y z qx qy qz qw, or the key of an se3; without, it is the robot's.
@@ -292,10 +293,10 @@ class Draft:
         """What you have linearized yourself, of up to 128 variables: r = sum H (x - y) + b.
 
         x - y is the local increment of a pose, the difference of anything else; values: y of each, as it is stored;
-        jacobians: H of each, (m, 3) of an se2 or point3, (m, 6) of an se3 or idp, (m, 2) of a point2; residual: b,
-        (m,), of any m, and the certainty is of these m.
-        kinds: of each; without, that of the variables in this draft, and of others by how many numbers they have: three
-        are a point3 where there are others of space, else an se2.
+        jacobians: H of each, (m, 3) of an se2 or point3, (m, 6) of an se3 or idp, (m, 2) of a point2, (m, n) of a
+        vector of n; residual: b, (m,), of any m, and the certainty is of these m.
+        kinds: of each, such as ["se3", "vector3"].  Without, that of the variables in this draft; of one of an earlier
+        insert it is wanted where several kinds have so many numbers: two, three or six.
         More rows than the variables have scalars are sent as the triangle that says the same.
         """
         numbers = key_numbers(keys).tolist()

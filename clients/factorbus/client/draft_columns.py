@@ -89,8 +89,11 @@ class DraftColumns:
 def known_kind(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
     """The kind of that name.  Raises UnknownKind."""
     if not isinstance(kind, str) or kind not in kinds:
-        known = kinds.names(str(kind)) if isinstance(kinds, FactorKinds) else tuple(kinds)
-        raise UnknownKind("draft", str(kind), known)
+        name = str(kind)
+        if not isinstance(kinds, FactorKinds):
+            raise UnknownKind("draft", name, tuple(kinds))
+        own = "" if "(" in name else "; one of your own is given as what @factor made of its function"
+        raise UnknownKind("draft", name, kinds.names(name), own)
     return kinds[kind]
 
 

@@ -9,15 +9,16 @@
 The parameter z is what is measured; the others are the variables, in this order.  What is returned is the residual: a
 number or a vector, a list of them, or a pose or rotation, which stands for its `log`.  The function is not sent, its
 formula is (`factorbus.proto.expressions.formula`), and it may not look at values: Python's `if` cannot see them,
-`select` can.
+`select` can.  What Python or NumPy would compute raises BadExpression, which says how it is written (`not_computed`).
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar, TypeAlias, cast, get_type_hints
 
+from factorbus.client.not_computed import NotComputed, no_attribute, no_numpy
 from factorbus.proto.expressions.declaration import CONSTANT, MEASURED, BadExpression, ExpressionNode, declare, type_of
 from factorbus.proto.expressions.operations import GROUPS, OPERATIONS, Mismatch, Type, name_of, value_size
 from factorbus.proto.kinds import FactorKind, own_kind
@@ -40,10 +41,13 @@ class _Trace:
         return Expression(self, self._known[node])
 
 
-class Expression:
+# What NumPy makes of `array * expression` and such.
+_UFUNCS = {name: name for name in ("add", "subtract", "multiply", "divide")} | {"true_divide": "divide"}
+
+
+class Expression(NotComputed):
     """Something that is computed of variables and of what is measured."""
 
-    __array_ufunc__ = None  # NumPy leaves `array * expression` to it
     # Of an annotation: the kind of variable that it stands for, and the type that it is of what is measured.
     named: ClassVar[str] = ""
     measures: ClassVar[Type] = 0
@@ -59,8 +63,15 @@ class Expression:
     def __len__(self) -> int:
         return value_size(self.kind)
 
-    def __bool__(self) -> bool:
-        raise TypeError("an expression has no value while it is written, so Python cannot decide by it; use select")
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise no_attribute(self.kind, name)
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *of: Any, **named: Any) -> Expression:
+        if method != "__call__" or named or ufunc.__name__ not in _UFUNCS:
+            raise no_numpy(ufunc.__name__)
+        return _do(_UFUNCS[ufunc.__name__], *of)
 
     def __repr__(self) -> str:
         return f"<expression of {name_of(self.kind)}>"
@@ -76,6 +87,9 @@ class Expression:
 
     def __rsub__(self, other: Operand) -> Expression:
         return _do("subtract", other, self)
+
+    def __pos__(self) -> Expression:
+        return self
 
     def __neg__(self) -> Expression:
         return _do("negate", self)
@@ -181,6 +195,8 @@ class Vector(Expression):
 
 def _do(operation: str, *of: Operand, numbers: Sequence[int] = ()) -> Expression:
     """Raises BadExpression: the operation does not take these."""
+    if any(isinstance(one, list | tuple) and any(isinstance(each, Expression) for each in one) for one in of):
+        raise BadExpression(f"{operation}: got a list with expressions in it; wanted vector(a, b), which joins them")
     known = [one for one in of if isinstance(one, Expression)]
     if not known:
         raise BadExpression(f"{operation}: got {list(of)!r}; wanted at least one expression, Python computes the rest")
@@ -197,11 +213,18 @@ def _do(operation: str, *of: Operand, numbers: Sequence[int] = ()) -> Expression
 
 
 def _constant(trace: _Trace, value: Any) -> Expression:
+    given = [*value] if hasattr(value, "__len__") and not isinstance(value, str | bytes) else [value]
     try:
-        numbers = tuple(map(float, value if hasattr(value, "__len__") else (value,)))
+        numbers = tuple(map(_number, given))
     except (TypeError, ValueError):
         raise BadExpression(f"got {value!r}; wanted an expression, a number, or a list of numbers") from None
     return trace.add(ExpressionNode(CONSTANT, (), numbers), len(numbers))
+
+
+def _number(given: Any) -> float:
+    if isinstance(given, str | bytes):  # which float would read
+        raise TypeError(f"{given!r} is text")
+    return float(given)
 
 
 def pose_at(position: Operand, turn: Operand) -> Expression:
@@ -274,20 +297,18 @@ def vector(*vectors: Operand) -> Expression:
     return _do("vector", *vectors)
 
 
-def factor(function: Callable[..., Any]) -> FactorKind:
+def factor(function: Callable[..., Any] | None = None, **keywords: Any) -> FactorKind:
     """The factor kind that a function of variables and of z writes down; it is called as the function.
 
     Raises BadExpression: what the function does is no such thing.
     """
-    name = getattr(function, "__name__", "?")
-    hints = get_type_hints(function)
-    variables, measured = list[tuple[str, str]](), None
-    for parameter in inspect.signature(function).parameters:
-        kind = hints.get(parameter)
-        if not (isinstance(kind, type) and issubclass(kind, Expression) and kind.named):
-            raise BadExpression(
-                f"{name}: {parameter} is annotated {kind!r}; wanted SE2, SE3, Point3, Vector[3] and such"
-            )
+    if keywords or not inspect.isfunction(function):
+        seen = ", ".join(keywords) or ("nothing" if function is None else repr(function)[:80])
+        raise BadExpression(
+            f"factor: got {seen}; wanted @factor without parentheses, above a function: its name is that of the kind"
+        )
+    name, variables, measured = function.__name__, list[tuple[str, str]](), None
+    for parameter, kind in _annotated(name, function):
         if parameter == MEASURED:
             measured = kind.measures
         else:
@@ -298,6 +319,25 @@ def factor(function: Callable[..., Any]) -> FactorKind:
     given = {parameter: Expression(trace, k) for k, parameter in enumerate((*(n for n, _ in variables), MEASURED))}
     residual = _residual(name, function(**given), trace)
     return own_kind(declare(name, tuple(variables), measured, trace.nodes, residual._node))
+
+
+def _annotated(name: str, function: Callable[..., Any]) -> Iterator[tuple[str, type[Expression]]]:
+    """The parameters with their types.  Raises BadExpression."""
+    hints = get_type_hints(function)
+    for each in inspect.signature(function).parameters.values():
+        parameter, kind = each.name, hints.get(each.name)
+        if each.kind not in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY):
+            raise BadExpression(f"{name}: {each} is a parameter; wanted one parameter for each variable, by its name")
+        if each.default is not each.empty:
+            raise BadExpression(
+                f"{name}: {parameter} has the default {each.default!r}, which no factor would have; wanted it without: "
+                "each factor says its variables and what it measures"
+            )
+        if not (isinstance(kind, type) and issubclass(kind, Expression) and kind.named):
+            raise BadExpression(
+                f"{name}: {parameter} is annotated {kind!r}; wanted SE2, SE3, Point2, Point3, IDP or Vector[1]"
+            )
+        yield parameter, kind
 
 
 def _residual(name: str, returned: Any, trace: _Trace) -> Expression:

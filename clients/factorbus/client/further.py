@@ -18,9 +18,11 @@ from factorbus.client.key_numbers import Key, key_number
 from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.proto.arrays import F64
 from factorbus.proto.derived_kinds import LENSES
-from factorbus.proto.problems import BadShape
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.problems import BadOption, BadShape
 from factorbus.proto.symbols import format_symbol
 
+_KEYWORDS = {"arm": "lever"}  # what a modifier is called here, where its name is another
 # In the order that names of kinds have them in.
 MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset", *LENSES)
 
@@ -113,7 +115,7 @@ def sensed(
     check_names(" ".join([kind, *(format_symbol(key_number(key)) for key in keys)]), certainty, of)
     given = {name: key_number(cast("Key", certainty[name])) for name in MODIFIERS if certainty.get(name) is not None}
     rest = {name: value for name, value in certainty.items() if name not in (*MODIFIERS, "twist")}
-    kind, row = "_".join([kind, *given]), as_numbers(f"{kind}: measured", measured)
+    kind, row = _together(kind, tuple(given)), as_numbers(f"{kind}: measured", measured)
     twist = certainty.get("twist")
     if ("offset" in given) != (twist is not None):
         seen = "offset without twist" if twist is None else "twist without offset"
@@ -121,6 +123,17 @@ def sensed(
     if twist is not None:
         row = as_numbers(kind, [*row.ravel(), *_twist(f"{kind}: twist", twist, 3 if "se2" in kind else 6)])
     return Measured(kind, (*keys, *given.values()), row, cast("Certainty", rest))
+
+
+def _together(kind: str, given: tuple[str, ...]) -> str:
+    """The kind with these further variables.  Raises BadOption: there is none with all of them."""
+    if (name := "_".join([kind, *given])) in FACTOR_KINDS:
+        return name
+    each = [of.modifiers for of in FACTOR_KINDS.values() if of.base == kind]
+    listed = ", ".join(" with ".join(_KEYWORDS.get(word, word) for word in words) for words in each)
+    seen = " and ".join(f"{_KEYWORDS.get(word, word)}=" for word in given)
+    wanted = f"one of: {listed}; or none. A factor of your own may have all (factorbus.client.expressions)"
+    raise BadOption(kind, f"the keys of {seen}, which do not go together", wanted)
 
 
 def odometry(kind: str, keys: tuple[Key, Key], measured: ArrayLike, certainty: Mapping[str, Any]) -> Measured:
@@ -154,6 +167,9 @@ def with_information(key: Key, certainty: Mapping[str, Any]) -> Mapping[str, Any
     check_names(where, certainty, GnssCertainty)
     rest = {name: value for name, value in certainty.items() if name != "covariance"}
     if certainty.get("covariance") is None:
+        sigmas = certainty.get("sigmas")
+        if sigmas is not None and np.shape(sigmas) != (3,):
+            raise BadShape(f"{where}: sigmas", f"shape {np.shape(sigmas)}", "(3,): of east, north, up (metres)")
         return rest
     return {**rest, **inverted(where, certainty["covariance"], rest)}
 

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from factorbus.client.arguments import all_finite, as_numbers, checked_row, of_type, seen
 from factorbus.client.certainty import Certainty
 from factorbus.client.frames import rotation_of
+from factorbus.client.imu_samples import refuse_gaps, refuse_not_finite, warn_implausible
 from factorbus.client.key_numbers import Key, key_numbers
 from factorbus.proto.arrays import F64
 from factorbus.proto.inertial import BIAS, MOST_SAMPLES, RESIDUAL, SAMPLE, ImuForm
@@ -120,18 +121,26 @@ def imu_factor(of: Moments, samples: ArrayLike, noise: ImuNoise, bias: ArrayLike
     if len(rows) > MOST_SAMPLES:
         wanted = f"1 to {MOST_SAMPLES}; put a pose in between, or join samples in pairs"
         raise BadShape(f"{of.where}: samples", len(rows), wanted)
+    warn_implausible(rows, of.gravity if of.gravity.size else np.array([0.0, 0.0, -STANDARD_GRAVITY]))
     row = np.concatenate([astuple(sensor), b, of.gravity, of.mount, rows.ravel()])
     return ImuForm(len(rows), of.form.mount, of.form.gravity).name, row
 
 
 def cut_samples(
-    times_s: ArrayLike, gyroscope: ArrayLike, accelerometer: ArrayLike, begin_s: float, end_s: float
+    times_s: ArrayLike,
+    gyroscope: ArrayLike,
+    accelerometer: ArrayLike,
+    begin_s: float,
+    end_s: float,
+    longest_s: float | None = None,
 ) -> F64:
     """The samples (n, 7) from `begin_s` to `end_s`, two poses' times: duration, gyroscopes, accelerometers.
 
     times_s (m,): when each was taken, increasing; gyroscope, accelerometer (m, 3): rad/s, m/s².
     A sample holds until the next one, the last one to `end_s`; what the first and the last hold is cut at the poses.
-    Raises BadShape, BadOption, NotFiniteNumbers: among others, no sample at `begin_s` or before.
+    longest_s: how long one may hold, without 10 times the median interval of all that are given; where samples were
+    lost for longer, the robot's motion is not known by this IMU, and the noise would say that it is.
+    Raises BadShape, BadOption, NotFiniteNumbers: among others, no sample at `begin_s` or before, a longer gap.
     """
     times = all_finite("times_s", as_numbers("times_s", times_s))
     rates = [all_finite(n, as_numbers(n, x)) for n, x in (("gyroscope", gyroscope), ("accelerometer", accelerometer))]
@@ -146,6 +155,7 @@ def cut_samples(
         first = f"the first sample is at {times[0]:g} s" if times.size else "no samples"
         raise BadOption("times_s", first, f"one at begin_s ({begin_s:g} s) or before")
     held = np.minimum(np.append(times[1:], np.inf), end_s) - np.maximum(times, begin_s)
+    refuse_gaps(times, held, end_s, longest_s)
     return np.column_stack([held, *rates])[held > 0.0]
 
 
@@ -168,7 +178,8 @@ def initial_from_standstill(
     up = mean[3:]
     size = float(np.linalg.norm(up))
     if abs(size - gravity) > _BIASED:
-        wanted = f"{gravity:g} ± {_BIASED:g} m/s²: specific force, which at rest points up"
+        units = "" if abs(size - 1.0) > 0.1 else f"; is it in g? Multiply by {STANDARD_GRAVITY}"
+        wanted = f"{gravity:g} ± {_BIASED:g} m/s²: specific force, which at rest points up{units}"
         raise BadOption("samples", f"a mean acceleration of {size:.4g} m/s²", wanted)
     error = spread / np.sqrt(len(rows))
     R = rotation_of(_checked_mount("mount", mount))
@@ -190,10 +201,11 @@ def _upright(up: F64) -> F64:
 
 def checked_samples(what: str, samples: ArrayLike) -> F64:
     """(n, 7), n ≥ 1, each of some duration."""
-    rows = all_finite(what, as_numbers(what, samples))
+    rows = as_numbers(what, samples)
     if rows.ndim != 2 or rows.shape[1] != SAMPLE or not len(rows):
         wanted = "(n, 7): duration (s), gyroscopes (rad/s, 3), accelerometers (m/s², 3)"
         raise BadShape(what, f"shape {rows.shape}", wanted)
+    refuse_not_finite(what, rows)
     if (rows[:, 0] <= 0.0).any():
         first = int(np.flatnonzero(rows[:, 0] <= 0.0)[0])
         raise BadOption(what, f"sample {first} lasts {rows[first, 0]:g} s", "durations above 0 s")

@@ -15,9 +15,6 @@ from factorbus.proto.messages import Factors
 from factorbus.proto.problems import BadInformation, BadShape, UnknownKind
 from factorbus.proto.symbols import format_symbol
 
-_SPACE = (6, 7)  # numbers of an idp and of an se3: what is with them and has three is a point3
-_BY_SIZE = {2: "point2", 3: "se2", 6: "idp", 7: "se3"}
-
 
 def linear_factor(
     keys: Sequence[int],
@@ -37,7 +34,7 @@ def linear_factor(
     y = [all_finite(where, as_numbers(f"{where}: values", value)) for value in values]
     names = list(kinds)
     if len(names) == len(y) and not all(names):
-        names = [name or guess for name, guess in zip(names, _kinds_of(where, y, names), strict=True)]
+        names = _all_kinds(where, keys, y, jacobians, names)
     b = all_finite(where, as_numbers(f"{where}: residual", residual))
     _check_counts(where, keys, len(y), len(jacobians), len(names))
     dims = _checked_dims(where, names, y)
@@ -82,16 +79,38 @@ def _checked_dims(where: str, names: Sequence[str], y: Sequence[F64]) -> list[in
     return [VARIABLE_KINDS[name].dim for name in names]
 
 
-def _kinds_of(where: str, y: Sequence[F64], names: Sequence[str]) -> list[str]:
-    """Of those without a name by how many numbers their values have; of the others "".  names: "" where not known."""
-    unnamed = [value for value, name in zip(y, names, strict=True) if not name]
-    for value in unnamed:
-        if value.ndim != 1 or value.size not in _BY_SIZE:
-            wanted = "(3,) of an se2 or point3, (7,) of an se3, (2,) of a point2, (6,) of an idp, or kinds="
-            raise BadShape(f"{where}: values", f"shape {value.shape}", wanted)
-    space = any(value.size in _SPACE for value in unnamed) or not {"se3", "point3", "idp"}.isdisjoint(names)
-    by_size = _BY_SIZE | {3: "point3"} if space else _BY_SIZE
-    return ["" if name else by_size[value.size] for value, name in zip(y, names, strict=True)]
+def _all_kinds(
+    where: str, keys: Sequence[int], y: Sequence[F64], jacobians: Sequence[ArrayLike], names: Sequence[str]
+) -> list[str]:
+    """The kinds, where one without a name, "", can be no other: by the numbers of y and of a row of H.
+
+    Raises BadShape: two numbers are a point2 or a vector2, three an se2, point3 or vector3, six an idp or a vector6.
+    """
+    found = list(names)
+    _check_counts(where, keys, len(y), len(jacobians), len(names))
+    for n, (key, value, J) in enumerate(zip(keys, y, jacobians, strict=True)):
+        if found[n]:
+            continue
+        could = _could_be(value, as_numbers(f"{where}: jacobian of {format_symbol(key)}", J))
+        if len(could) != 1:
+            which = " or ".join([", ".join(could[:-1]), could[-1]]) if could else "of no kind"
+            seen = f"shape {value.shape}, with a jacobian of shape {np.shape(J)}: {which}"
+            wanted = f"kinds=, one for each of the {len(keys)}, such as kinds={_example(found, n, could)}"
+            raise BadShape(f"{where}: value of {format_symbol(key)}, which is not in this draft", seen, wanted)
+        found[n] = could[0]
+    return found
+
+
+def _could_be(value: F64, J: F64) -> list[str]:
+    """The kinds of variables that have so many numbers, and so many in their tangent."""
+    columns = J.shape[1] if J.ndim == 2 else -1
+    kinds = [kind for kind in VARIABLE_KINDS.values() if value.shape == (kind.size,)]
+    return [kind.name for kind in kinds if columns in (kind.dim, -1)] or [kind.name for kind in kinds]
+
+
+def _example(names: Sequence[str], n: int, could: Sequence[str]) -> list[str]:
+    """What `kinds=` could be; "..." for those that are not known either."""
+    return [name or (could[-1] if k == n and could else "...") for k, name in enumerate(names)]
 
 
 def _block(where: str, given: ArrayLike, shape: tuple[int, int]) -> F64:

@@ -22,6 +22,7 @@ from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import PendingInsert
 from factorbus.client.questions import Questions, logged
+from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.client.supported import check_changes, check_stamps
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
@@ -173,13 +174,14 @@ class Map:
         it, if both maps have one frame: nothing is transformed then, and anchors are not needed.
 
         Raises KeyCollision, NoAnchor, AbsoluteFactors, CannotMerge, BadSymbol, TooLarge: nothing was sent.  Raises
-        Refused (the map is as it was), Unavailable.
+        Refused (the map is as it was; `kind_taken`: see `rename_kinds`), Unavailable.
         """
         if not isinstance(other, MapGraph):
             other = of_type("other", other, Map, "a Map, or the MapGraph of one").graph(timeout_s)
         here = self.ask_estimate(timeout_s=timeout_s)
         fitted = fit_into(here, other, anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute)
-        return Merged(self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
+        with saying_how_to_rename():
+            return Merged(self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
 
     def send(
         self,

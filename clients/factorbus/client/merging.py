@@ -150,6 +150,11 @@ def _size_of(batch: Batch) -> int:
     sizes = {SPACES.get(group.kind, 0) for group in placed}
     if len(sizes) != 1 or 0 in sizes:
         kinds = ", ".join(sorted({group.kind for group in batch.variables})) or "nothing"
+        if batch.variables and not placed:
+            raise CannotMerge(
+                f"the other map has {kinds} alone, which have no frame that could be brought into this one's; "
+                "insert its graph().batch as it is, if its keys are free here"
+            )
         raise CannotMerge(f"the other map has {kinds}; wanted variables of the plane alone, or of space")
     return sizes.pop()
 

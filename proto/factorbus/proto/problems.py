@@ -157,8 +157,9 @@ class BadOption(BadMessage):
 class UnknownKind(BadMessage):
     code = "unknown_kind"
 
-    def __init__(self, where: str, kind: str, known: tuple[str, ...]) -> None:
-        super().__init__(where, f"kind {kind[:64]!r} is not known here", f"one of {', '.join(known)}")
+    def __init__(self, where: str, kind: str, known: tuple[str, ...], also: str = "") -> None:
+        wanted = f"one of {', '.join(known)}{also}{nearest(kind[:64], filter(str.isidentifier, known))}"
+        super().__init__(where, f"kind {kind[:64]!r} is not known here", wanted)
         self.detail["kind"] = kind[:64]
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from factorbus.proto.kinds import name_of_kind
 from factorbus.proto.symbols import format_symbol
 from factorbus.wording import counted
 
@@ -53,7 +54,7 @@ def _of_variable(revision: int, variable: Mapping[str, Any], step: Mapping[str, 
 
 def _of_factor(factor: Mapping[str, Any], step: Mapping[str, Any]) -> str:
     ends = ", ".join(format_symbol(int(key)) for key in factor.get("keys", ()))
-    told = f"factor {factor.get('factor', '?')}, {factor.get('kind', '')} ({ends})"
+    told = f"factor {factor.get('factor', '?')}, {name_of_kind(factor.get('kind', ''))} ({ends})"
     if factor.get("chi2") is not None:
         told += f": χ² {factor['chi2']:.3g}"
     if factor.get("without") is not None:

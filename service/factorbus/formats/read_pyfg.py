@@ -70,11 +70,32 @@ def read_pyfg(file: str, buckets: Mapping[str, Bucket], left: LeftOut) -> tuple[
             short = name if len(name) <= 40 else name[:37] + "..."
             left.leave(short, buckets[name].numbers, "no pyfg record that is read")
     vertices = [_vertices(file, VERTICES[name].kind, of) for name, of in found.items() if name in VERTICES]
+    _refuse_undeclared(file, found)
     edges = [_edges(file, FACTORS[name].kind, of) for name, of in found.items() if name in FACTORS and name != RANGE]
     if RANGE in found:
         edges += [_edges(file, kind, part) for kind, part in _ranges(file, found[RANGE], vertices, edges, left)]
     batch, lines = assembled(file, True, False, vertices, edges, None)
     return _stamped(file, batch, found, left), lines
+
+
+def _refuse_undeclared(file: str, found: Mapping[str, _Lines]) -> None:
+    """A misspelt name would be one more variable.  A file of no vertices at all has its poses by odometry.
+
+    Raises FormatError.
+    """
+    declared = [of.keys for name, of in found.items() if name in VERTICES]
+    if not declared:
+        return
+    known = np.concatenate([keys.ravel() for keys in declared])
+    for name, of in found.items():
+        if name in FACTORS and name != RANGE:
+            missing = ~np.isin(of.keys, known)
+
+            def lost(row: int, name: str = name, of: _Lines = of, missing: np.ndarray = missing) -> str:
+                key = format_symbol(int(of.keys[row][missing[row]][0]))
+                return f"{name} of {key}, of which there is no vertex line"
+
+            refuse_first(file, of.lines, missing.any(axis=1), lost, "a vertex line for it, as the file has of others")
 
 
 def _lines(file: str, name: str, record: Record, bucket: Bucket) -> _Lines:

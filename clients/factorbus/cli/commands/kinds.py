@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("formula", required=False)
 @click.option("--map", "name", metavar="MAP", help="The own kinds that this map has factors of.")
-@click.option("--operations", is_flag=True, help="What a formula may do.")
+@click.option("--operations", is_flag=True, help="What a formula may do, and what it may not.")
 @click.option(
     "--test", is_flag=True, help="Hold the solver's Jacobian of FORMULA against differences, at random values."
 )
@@ -34,10 +34,11 @@ def command(
     timeout_s: float,
     as_json: bool,
 ) -> None:
-    """List the kinds of factors; or say what FORMULA, a kind of your own, means.
+    """List the kinds of factors; or say what FORMULA means, a kind of your own or the name of one in the list.
 
     \b
     factorbus kinds
+    factorbus kinds range_se2_bias
     factorbus kinds --operations
     factorbus kinds 'near(a:se2,l:point2,z:1)=subtract(norm(act(inverse(a),l)),z)' --test
     factorbus kinds --map warehouse
@@ -45,29 +46,65 @@ def command(
     if (formula is not None) + (name is not None) + operations > 1 or (test and formula is None):
         raise click.UsageError("give FORMULA (with --test or without), --map or --operations")
     from factorbus.cli.output import console as screen
-    from factorbus.proto.kinds import FACTOR_KINDS
+    from factorbus.proto.expressions.operations import ABSENT, LEGEND
 
     if operations:
         found = _operations()
     elif name is not None:
         found = {kind.called: kind.name for kind in _of_map(name, endpoint, zenoh, timeout_s)}
     elif formula is None:
-        found = {kind.name: f"{', '.join(kind.connects)}: {kind.residual}" for kind in FACTOR_KINDS.values()}
+        found = _every()
+    elif "(" not in formula:
+        found = _of_name(formula, test)
     else:
         declared = _declared(formula)
         found = _meaning(declared) | ({"test": _tested(declared)} if test else {})
+    notes = [LEGEND, ABSENT] if operations else []
     if as_json:
-        screen.document({"kinds": found})
+        screen.document({"kinds": found} | ({"notes": notes} if notes else {}))
     elif found:
         screen.table((called, str(means)) for called, means in found.items())
     else:
         screen.print_note(f"map {name} has factors of no kinds but the service's")
+    for note in [] if as_json else notes:
+        click.echo(note)
 
 
 def _operations() -> dict[str, str]:
     from factorbus.proto.expressions.operations import OPERATIONS
 
-    return {each.name: each.means for each in OPERATIONS.values()}
+    return {each.signature(): f"{each.forms}: {each.means}" for each in OPERATIONS.values()}
+
+
+def _every() -> dict[str, str]:
+    """Those that are in a table, and the families of those that are made when they are named."""
+    from factorbus.proto import inertial
+    from factorbus.proto.kinds import FACTOR_KINDS, LINEAR_NAME, linear_kind
+
+    samples = inertial.ImuForm(1)
+    families = {
+        LINEAR_NAME: f"any: {linear_kind(1, ('se2',)).residual}",
+        inertial.NAME: f"{', '.join(samples.ends)}: {samples.residual}",
+    }
+    return {kind.name: f"{', '.join(kind.connects)}: {kind.residual}" for kind in FACTOR_KINDS.values()} | families
+
+
+def _of_name(name: str, test: bool) -> dict[str, Any]:
+    """What a kind means that is no formula."""
+    from factorbus.proto.kinds import FACTOR_KINDS
+    from factorbus.proto.problems import UnknownKind
+
+    if name not in FACTOR_KINDS:
+        raise Stopped("unknown_kind", str(UnknownKind("FORMULA", name, FACTOR_KINDS.names(name))), REFUSED)
+    if test:
+        raise click.UsageError(f"--test is of a formula, and {name} is a kind of the service, whose tests hold it")
+    kind = FACTOR_KINDS[name]
+    return {
+        "name": name,
+        "variables": ", ".join(kind.connects),
+        "measured": kind.measured,
+        "residual": f"{counted(kind.dim, 'number')}: {kind.residual}",
+    }
 
 
 def _declared(formula: str) -> "Declaration":

@@ -17,6 +17,7 @@ class MergeOptions:
 
     source: str | None
     letters: tuple[str, ...]
+    kinds: tuple[str, ...]
     anchors: tuple[tuple[str, str, str], ...]
     frame: str | None
     sigmas: str | None
@@ -27,6 +28,7 @@ class MergeOptions:
 @click.argument("other")
 @click.option("--from", "source", metavar="ENDPOINT", help="The service that has OTHER.  [default: that of --connect]")
 @click.option("--letter", "letters", multiple=True, metavar="OLD=NEW", help="Keys of OTHER get another letter: x=y.")
+@click.option("--kind", "kinds", multiple=True, metavar="OLD=NEW", help="Own kinds of OTHER get another name.")
 @click.option(
     "--anchor",
     "anchors",
@@ -60,10 +62,11 @@ def merge_command(address: MapAddress, other: str, merging: MergeOptions, settle
     factorbus change merge hall yard --from tcp/10.0.0.7:7447 --letter x=z --frame 12,-3,0.5 --sigmas 1,1,0.1
     """
     from factorbus.cli.process.bus import open_bus
+    from factorbus.client.renaming_kinds import rename_kinds
 
     sigmas = merging.sigmas
     how = {
-        "letters": dict(_pair(each) for each in merging.letters),
+        "letters": dict(_pair("--letter", each, "x=y") for each in merging.letters),
         "anchors": _draft(merging.anchors, sigmas) if merging.anchors else None,
         "frame": _numbers("--frame", merging.frame) if merging.frame else None,
         "sigmas": _numbers("--sigmas", sigmas) if sigmas else None,
@@ -77,6 +80,7 @@ def merge_command(address: MapAddress, other: str, merging: MergeOptions, settle
         ):
             graph = theirs.graph(timeout_s)
         with advising(MERGING), bus.map(address.name, mirror=False, create=False) as joined:
+            graph = rename_kinds(graph, dict(_pair("--kind", each, "wheel=wheel_2") for each in merging.kinds))
             merged = joined.merge(graph, settle=settle, **how)
     _show(merged, as_json)
     return OK
@@ -121,8 +125,8 @@ def _numbers(option: str, text: str) -> list[float]:
         raise click.UsageError(f"{option} is {text!r}; wanted numbers with commas between: 0,2,-1.57") from None
 
 
-def _pair(text: str) -> tuple[str, str]:
+def _pair(option: str, text: str, example: str) -> tuple[str, str]:
     old, equals, new = text.partition("=")
     if not equals:
-        raise click.UsageError(f"--letter is {text!r}; wanted OLD=NEW, such as x=y")
+        raise click.UsageError(f"{option} is {text!r}; wanted OLD=NEW, such as {example}")
     return old, new

@@ -24,6 +24,7 @@ MERGING = {
     "key_collision": "Give the variables of OTHER a letter of their own, such as --letter x=y",
     "no_anchor": "Give a relative pose between a pose of each map, that of OTHER under its new key "
     "(--anchor x5 y8 0,2,-1.57), or --frame; both with --sigmas",
+    "kind_taken": "Give the kind of OTHER another name, such as --kind wheel=wheel_2",
     "absolute_factors": "--absolute leave-out merges it without them, --absolute keep as it is, if both have one frame",
 }
 

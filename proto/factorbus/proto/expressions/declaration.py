@@ -20,6 +20,7 @@ from factorbus.proto.expressions.operations import (
     tangent_size,
     value_size,
 )
+from factorbus.proto.nearest import nearest
 from factorbus.proto.variable_kinds import VARIABLE_KINDS
 from factorbus.wording import counted
 
@@ -29,6 +30,7 @@ MOST_RESULTS = 1024  # numbers of the values of all nodes
 MEASURED = "z"
 NAME = re.compile(r"[a-z][a-z0-9_]{0,62}")
 PARAMETER = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_NAMES = "up to {} small letters, digits and _, a letter first"
 
 
 class BadExpression(ValueError):
@@ -112,7 +114,9 @@ def type_of(kind: str) -> Type:
     of = VARIABLE_KINDS.get(kind)
     if of is None or of.size != of.dim:
         has = [name for name, has in VARIABLE_KINDS.items() if name in GROUPS or has.size == has.dim]
-        raise BadExpression(f"{kind!r} is no kind of variable of an expression; wanted {', '.join(has)}")
+        raise BadExpression(
+            f"{kind!r} is no kind of variable of an expression; wanted {', '.join(has)}{nearest(kind, has)}"
+        )
     return of.size
 
 
@@ -143,14 +147,14 @@ def _checked(declared: Declaration) -> tuple[Type, ...]:
 def _check_head(declared: Declaration) -> None:
     name, measured, parameters = declared.name, declared.measured, declared.parameters
     if not NAME.fullmatch(name):
-        raise BadExpression(f"a kind cannot be called {name[:80]!r}; wanted up to 63 small letters, digits and _")
+        raise BadExpression(f"a kind cannot be called {name[:80]!r}; wanted {_NAMES.format(63)}")
     if not 1 <= len(declared.variables) <= MOST_VARIABLES:
         raise BadExpression(f"{name}: {counted(len(declared.variables), 'variable')}; wanted 1 to {MOST_VARIABLES}")
     for called in parameters:
         if not PARAMETER.fullmatch(called) or parameters.count(called) > 1:
             raise BadExpression(
-                f"{name}: a variable is called {called[:80]!r}; wanted a name of its own of up to 32 small letters, "
-                f"digits and _, and {MEASURED} for what is measured alone"
+                f"{name}: a variable is called {called[:80]!r}; wanted a name of its own of {_NAMES.format(32)}, "
+                f"and {MEASURED} for what is measured alone"
             )
     if measured not in GROUPS and not (isinstance(measured, int) and 1 <= measured <= MOST_MEASURED):
         raise BadExpression(
@@ -167,7 +171,9 @@ def _type_of_node(declared: Declaration, node: ExpressionNode, types: Sequence[T
         return _type_of_constant(where, node)
     operation = OPERATIONS.get(node.operation)
     if operation is None:
-        raise BadExpression(f"{where}: there is no such operation; wanted {', '.join(OPERATIONS)}")
+        raise BadExpression(
+            f"{where}: there is no such operation; wanted {', '.join(OPERATIONS)}{nearest(node.operation, OPERATIONS)}"
+        )
     if any(not 0 <= k < here for k in node.of) or operation.arguments not in (-1, len(node.of)):
         wanted = "any number" if operation.arguments < 0 else str(operation.arguments)
         raise BadExpression(f"{where}: its arguments are {list(node.of)}; wanted {wanted} of the nodes before it")

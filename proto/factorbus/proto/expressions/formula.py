@@ -22,9 +22,11 @@ from factorbus.proto.expressions.declaration import (
     declare,
 )
 from factorbus.proto.expressions.operations import OPERATIONS, Type
+from factorbus.proto.nearest import nearest
 
 MOST_CHARACTERS = 16384
-_TOKEN = re.compile(r"\s*(?:([a-z_][a-z0-9_]*)|([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)|([():,=;\[\]]))")
+_TOKEN = re.compile(r"\s*(?:([a-z_][a-z0-9_]*)|([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)|([():,=;\[\]]))", re.ASCII)
+_LETTERS = "small letters, digits, _ and ( ) [ ] , : ; = - + . of ASCII alone"
 _FORM = "name(a:KIND,b:KIND,z:TYPE)=residual"
 
 
@@ -150,7 +152,8 @@ class _Reader:
                 else:
                     found = self._add(ExpressionNode(CONSTANT, (), (number,)))
             else:
-                raise self._wrong(f"a variable, a number, or one of {', '.join(OPERATIONS)}", token)
+                there = f"a variable, a number, or one of {', '.join(OPERATIONS)}"
+                raise self._wrong(there + nearest(token, [*known, *OPERATIONS]), token)
             while calls:
                 if found >= 0:
                     calls[-1].of.append(found)
@@ -191,14 +194,14 @@ class _Reader:
     def _next(self) -> str:
         found = _TOKEN.match(self._text, self._here)
         if found is None:
-            raise self._wrong("more of a formula")
+            raise self._wrong(_LETTERS if self._text[self._here :].strip() else "more of a formula")
         self._here = found.end()
         return found[1] or found[2] or found[3]
 
     def _word(self) -> str:
         word = self._next()
         if not word[0].isalpha():
-            raise self._wrong("a name", word)
+            raise self._wrong("a name, which begins with a small letter", word)
         return word
 
     def _take(self, mark: str) -> None:

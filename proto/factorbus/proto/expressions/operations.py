@@ -2,10 +2,13 @@
 
 A type is a rotation ("so3"), a pose ("se2", "se3") or a vector of n numbers, written as the number n; a scalar is a
 vector of one.  Values are as those of variables: an so3 is a unit quaternion (x, y, z, w).
+
+Every operation is declared by its forms, such as "se2, 2 → 2": what is checked and what people read is made of these.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeAlias
 
 from factorbus.wording import counted
@@ -44,129 +47,148 @@ def zero_of(kind: Type) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One operation.  gives: the type of its result, of those of its arguments; raises Mismatch.
+    """One operation.
 
-    arguments: how many expressions it takes, −1: any number.  numbers: how many constant integers come after them.
-    means: for people, with a and b, its arguments.
+    means: for people, with a, b and c, its arguments.  forms: the types that it takes and gives, one or more "A, B → C"
+    with ";" between: n is any number of numbers, the same throughout a form, G one of GROUPS.  wants: what arguments it
+    takes, for people.  numbers: how many constant integers come after them.
     """
 
     name: str
-    arguments: int
     means: str
-    gives: Callable[[Sequence[Type], Sequence[int]], Type]
+    forms: str
+    wants: str
     numbers: int = 0
 
+    @property
+    def arguments(self) -> int:
+        """How many expressions it takes, −1: any number."""
+        takes = _forms(self.forms)[0][0]
+        return -1 if _MORE in takes else len(takes)
 
-def _need(given: Sequence[Type], wanted: str, *, holds: bool) -> None:
-    if not holds:
-        raise Mismatch(f"got {' and '.join(map(name_of, given)) or 'nothing'}, wanted {wanted}")
+    def gives(self, given: Sequence[Type], numbers: Sequence[int]) -> Type:
+        """The type of the result, of those of the arguments and the constant integers.  Raises Mismatch."""
+        if self.arguments < 0:
+            return self._joined(given)
+        for takes, result in _forms(self.forms):
+            bound: dict[str, Type] = {}
+            if all(_fits(wanted, kind, bound) for wanted, kind in zip(takes, given, strict=True)):
+                return self._taken(given[0], numbers) if self.numbers else bound.get(result, _type(result))
+        raise self._mismatch(given, self.wants)
 
+    def signature(self) -> str:
+        """How it is written, with the names of its arguments."""
+        if self.arguments < 0:
+            return f"{self.name}(a,b,...)"
+        return f"{self.name}({','.join([*'abc'[: self.arguments], *(_COUNTS if self.numbers else ())])})"
 
-def _is_vector(kind: Type) -> bool:
-    return isinstance(kind, int)
+    def _taken(self, kind: Type, numbers: Sequence[int]) -> Type:
+        first, count = numbers
+        if first < 0 or count < 1:
+            raise Mismatch(f"first is {first} and count is {count}, wanted first from 0 on and count from 1 on")
+        if not isinstance(kind, int) or first + count > kind:
+            raise self._mismatch([kind], f"a vector of at least {counted(first + count, 'number')}")
+        return count
 
+    def _joined(self, given: Sequence[Type]) -> Type:
+        sizes = [kind for kind in given if isinstance(kind, int)]
+        if not given or len(sizes) < len(given):
+            raise self._mismatch(given, self.wants)
+        if sum(sizes) > MOST_NUMBERS:
+            raise self._mismatch(given, f"at most {MOST_NUMBERS} numbers together")
+        return sum(sizes)
 
-def _same_group(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-    _need(given, "rotations or poses of one kind", holds=given[0] in GROUPS and len(set(given)) == 1)
-    return given[0]
-
-
-def _moved(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-    size = {SO3: 3, SE3: 3, SE2: 2}.get(given[0], 0) if isinstance(given[0], str) else 0
-    _need(given, "a pose or rotation, and a vector of its space", holds=size > 0 and given[1] == size)
-    return size
-
-
-def _of(wanted: dict[tuple[Type, ...], Type], words: str) -> Callable[[Sequence[Type], Sequence[int]], Type]:
-    """Where a table has all cases."""
-
-    def gives(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-        _need(given, words, holds=tuple(given) in wanted)
-        return wanted[tuple(given)]
-
-    return gives
-
-
-def _alike(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-    _need(given, "vectors of one size", holds=_is_vector(given[0]) and len(set(given)) == 1)
-    return given[0]
-
-
-def _to_number(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-    _alike(given, _numbers)
-    return 1
-
-
-def _scaled(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-    vectors = all(map(_is_vector, given))
-    _need(given, "vectors of one size, or one of them a number", holds=vectors and (1 in given or given[0] == given[1]))
-    return given[1] if given[0] == 1 else given[0]
+    def _mismatch(self, given: Sequence[Type], wanted: str) -> Mismatch:
+        return Mismatch(f"got {' and '.join(map(name_of, given)) or 'nothing'}, wanted {wanted}")
 
 
-def _divided(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-    _need(given, "a vector and a number", holds=_is_vector(given[0]) and given[1] == 1)
-    return given[0]
+_ANY, _GROUP, _MORE, _COUNTS = "n", "G", "…", ("first", "count")
 
 
-def _selected(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-    alike = _is_vector(given[1]) and given[1] == given[2]
-    _need(given, "a number, and two vectors of one size", holds=given[0] == 1 and alike)
-    return given[1]
+@lru_cache(maxsize=64)
+def _forms(text: str) -> tuple[tuple[tuple[str, ...], str], ...]:
+    """What each form takes, and what it gives."""
+    sides = [form.split(" → ") for form in text.split("; ")]
+    return tuple((tuple(takes.split(", ")), result) for takes, result in sides)
 
 
-def _taken(given: Sequence[Type], numbers: Sequence[int]) -> Type:
-    first, count = numbers
-    inside = isinstance(given[0], int) and first >= 0 and count >= 1 and first + count <= given[0]
-    _need(given, f"a vector of at least {counted(first + count, 'number')}", holds=inside)
-    return count
+def _type(word: str) -> Type:
+    return int(word) if word.isdecimal() else word
 
 
-def _joined(given: Sequence[Type], _numbers: Sequence[int]) -> Type:
-    _need(given, "vectors", holds=len(given) > 0 and all(map(_is_vector, given)))
-    total = sum(kind for kind in given if isinstance(kind, int))
-    _need(given, f"at most {MOST_NUMBERS} numbers", holds=total <= MOST_NUMBERS)
-    return total
+def _fits(wanted: str, kind: Type, bound: dict[str, Type]) -> bool:
+    """Whether a type is what a form wants there; bound: what n and G are, from the first that they stand for."""
+    if wanted == _ANY:
+        return isinstance(kind, int) and bound.setdefault(_ANY, kind) == kind
+    if wanted == _GROUP:
+        return kind in GROUPS and bound.setdefault(_GROUP, kind) == kind
+    return kind == _type(wanted)
 
 
-_LOG = _of({(SO3,): 3, (SE2,): 3, (SE3,): 6}, "a rotation or a pose")
-_ANGLE = _of({(1,): 1}, "a number")
+_ALIKE = "vectors of one size"
+_POSE = "a pose"
+_ANGLE = "a number"
+_SPACED = "a pose or rotation, and a vector of its space"
+_SPACES = "se2, 2 → 2; se3, 3 → 3; so3, 3 → 3"
 
 OPERATIONS = {
     operation.name: operation
     for operation in (
-        Operation("compose", 2, "a ∘ b", _same_group),
-        Operation("inverse", 1, "a⁻¹", _same_group),
-        Operation("act", 2, "the point b of a's frame, in the frame that a is seen from", _moved),
-        Operation("rotate", 2, "the direction b of a's frame, in the frame that a is seen from", _moved),
-        Operation("position", 1, "where the pose a is", _of({(SE2,): 2, (SE3,): 3}, "a pose")),
-        Operation("rotation", 1, "how the pose a is turned", _of({(SE3,): SO3}, "a pose in space")),
-        Operation("heading", 1, "θ of the pose a", _of({(SE2,): 1}, "a pose in the plane")),
+        Operation("compose", "a ∘ b", "G, G → G", "rotations or poses of one kind"),
+        Operation("inverse", "a⁻¹", "G → G", "a rotation or a pose"),
+        Operation("act", "the point b of a's frame, in the frame that a is seen from", _SPACES, _SPACED),
+        Operation("rotate", "the direction b of a's frame, in the frame that a is seen from", _SPACES, _SPACED),
+        Operation("position", "where the pose a is", "se2 → 2; se3 → 3", _POSE),
+        Operation("rotation", "how the pose a is turned", "se3 → so3", "a pose in space"),
+        Operation("heading", "θ of the pose a", "se2 → 1", "a pose in the plane"),
         Operation(
             "pose",
-            2,
             "the pose at a, turned by b",
-            _of({(2, 1): SE2, (3, SO3): SE3}, "2 numbers and a heading, or 3 and a rotation"),
+            "2, 1 → se2; 3, so3 → se3",
+            "2 numbers and a heading, or 3 and a rotation",
         ),
         Operation(
-            "log", 1, "the rotation vector of a; of a pose its position, and behind it that, in the plane θ", _LOG
+            "log",
+            "the rotation vector of a; of a pose its position, and behind it that, in the plane θ",
+            "so3 → 3; se2 → 3; se3 → 6",
+            "a rotation or a pose",
         ),
-        Operation("exp", 1, "the rotation by the rotation vector a", _of({(3,): SO3}, "3 numbers")),
-        Operation("vector_part", 1, "(x, y, z) of the quaternion a or −a, with w ≥ 0", _of({(SO3,): 3}, "a rotation")),
-        Operation("norm", 1, "‖a‖", _to_number),
-        Operation("dot", 2, "aᵀ b", _to_number),
-        Operation("cross", 2, "a × b", _of({(3, 3): 3, (2, 2): 1}, "two vectors of 3, or of 2")),
-        Operation("atan2", 2, "the angle of (b, a), radians", _of({(1, 1): 1}, "two numbers")),
-        Operation("sqrt", 1, "√a", _ANGLE),
-        Operation("sin", 1, "sin a", _ANGLE),
-        Operation("cos", 1, "cos a", _ANGLE),
-        Operation("wrap", 1, "a, an angle, in [−π, π)", _ANGLE),
-        Operation("select", 3, "b where a ≥ 0, else c", _selected),
-        Operation("add", 2, "a + b", _alike),
-        Operation("subtract", 2, "a − b", _alike),
-        Operation("negate", 1, "−a", _alike),
-        Operation("multiply", 2, "a b, number by number, or by the one number of one of them", _scaled),
-        Operation("divide", 2, "a / b", _divided),
-        Operation("part", 1, "numbers of a: from which on, and how many", _taken, numbers=2),
-        Operation("vector", -1, "the numbers of all, one after the other", _joined),
+        Operation("exp", "the rotation by the rotation vector a", "3 → so3", "3 numbers"),
+        Operation("vector_part", "(x, y, z) of the quaternion a or −a, with w ≥ 0", "so3 → 3", "a rotation"),
+        Operation("norm", "‖a‖", "n → 1", _ALIKE),
+        Operation("dot", "aᵀ b", "n, n → 1", _ALIKE),
+        Operation("cross", "a × b", "3, 3 → 3; 2, 2 → 1", "two vectors of 3, or of 2"),
+        Operation("atan2", "the angle of (b, a), radians", "1, 1 → 1", "two numbers"),
+        Operation("sqrt", "√a", "1 → 1", _ANGLE),
+        Operation("sin", "sin a", "1 → 1", _ANGLE),
+        Operation("cos", "cos a", "1 → 1", _ANGLE),
+        Operation("wrap", "a, an angle, in [−π, π)", "1 → 1", _ANGLE),
+        Operation("select", "b where a ≥ 0, else c", "1, n, n → n", "a number, and two vectors of one size"),
+        Operation("add", "a + b", "n, n → n", _ALIKE),
+        Operation("subtract", "a − b", "n, n → n", _ALIKE),
+        Operation("negate", "−a", "n → n", _ALIKE),
+        Operation(
+            "multiply",
+            "a b, number by number, or by the one number of one of them",
+            "n, n → n; 1, n → n; n, 1 → n",
+            "vectors of one size, or one of them a number",
+        ),
+        Operation("divide", "a / b", "n, 1 → n", "a vector and a number"),
+        Operation(
+            "part", "count numbers of a, from the number first on, which is 0 or more", "n → count", "a vector", 2
+        ),
+        Operation("vector", "the numbers of all, one after the other, 64 at most", "n, m, … → n + m + …", "vectors"),
     )
 }
+
+# What is to be known of the table, for people.
+LEGEND = (
+    "n and m are any number of numbers, the same throughout a form; G is so3, se2 or se3; first and count are integers."
+)
+# What people look for in vain, and what does instead.
+ABSENT = (
+    "There is no power, logarithm or exponential of numbers, no abs, tan, min or max. Write a² of a number as "
+    "multiply(a,a), ‖a‖² as dot(a,a), |a| of a number as norm(a), tan a as divide(sin(a),cos(a)), the larger of two "
+    "as select(subtract(a,b),a,b). Send as z the logarithm of what was read; that of a variable is made of roots and a "
+    "series."
+)
