@@ -141,6 +141,11 @@ def _cross(_kinds: Sequence[Type], _numbers: Sequence[int], a: F64, b: F64) -> A
     return np.cross(a, b) if len(a) == 3 else a[0] * b[1] - a[1] * b[0]
 
 
+def _over(a: F64, b: F64) -> F64:
+    """a / b; no number where b is 0."""
+    return a * (np.nan if b[0] == 0.0 else 1.0 / b[0])
+
+
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
     """An operation that looks at values alone."""
     return lambda _kinds, _numbers, *of: function(*of)
@@ -171,7 +176,7 @@ _DO: dict[str, Callable[..., Any]] = {
     "subtract": _plain(np.subtract),
     "negate": _plain(np.negative),
     "multiply": _plain(np.multiply),
-    "divide": _plain(np.divide),
+    "divide": _plain(_over),
     "part": lambda _kinds, numbers, a: a[numbers[0] : numbers[0] + numbers[1]],
     "vector": _plain(lambda *all_of: np.concatenate(all_of)),
 }
