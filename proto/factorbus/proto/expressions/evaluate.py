@@ -159,7 +159,7 @@ _DO: dict[str, Callable[..., Any]] = {
     "position": lambda kinds, _numbers, a: a[: 2 if kinds[0] == SE2 else 3],
     "rotation": _plain(lambda a: a[3:]),
     "heading": _plain(lambda a: a[2:]),
-    "pose": _plain(lambda a, b: np.concatenate([a, b])),
+    "pose": _plain(lambda a, b: np.concatenate([a, _wrap(b) if len(a) == 2 else b])),
     "log": _logarithm,
     "exp": _plain(_exp),
     "vector_part": _plain(lambda a: _positive(a)[:3]),

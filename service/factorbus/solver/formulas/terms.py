@@ -80,6 +80,10 @@ class Code:
             self._made[key] = Term(self, make(builder, values), wide, most)
         return self._made[key]
 
+    def is_made(self, operation: str, wide: bool, operands: tuple[Operand, ...]) -> bool:
+        """Whether that has been asked for before."""
+        return (operation, wide, *(_identity(operand) for operand in operands)) in self._made
+
     def function(self, name: str, arguments: int) -> Any:
         """A function of the C library, or of LLVM, of that number of numbers."""
         known = self.module.globals.get(name)
@@ -164,6 +168,8 @@ def _instruction(name: str, a: Operand, b: Operand) -> Operand:
     if name != "fdiv":
         most = _most(a) * _most(b) if name == "fmul" else _most(a) + _most(b)
         most = most if most < _MAY_OVERFLOW else math.inf
+    if name == "fmul" and terms[0].code.is_made(name, wide, (b, a)):
+        a, b = b, a
     return terms[0].code.once(name, wide, (a, b), lambda builder, of: getattr(builder, name)(*of, flags=_MAY), most)
 
 
@@ -174,6 +180,8 @@ def plus(a: Operand, b: Operand) -> Operand:
 
 def minus(a: Operand, b: Operand) -> Operand:
     """a − b"""
+    if a is b and isinstance(a, Term) and math.isfinite(a.most):
+        return 0.0  # else the processor may take a product from itself before that is rounded
     return -b if _is(a, 0.0) else a if _is(b, 0.0) else _instruction("fsub", a, b)
 
 

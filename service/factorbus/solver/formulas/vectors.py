@@ -1,7 +1,7 @@
 """Operations of vectors and numbers: the numbers of the result, and its slopes.  MATH §3.11.
 
-None of them fails: a root of what is negative, and what is divided by 0, is no number, NaN.  The root of 0 and the length
-of a vector of zeros have no slope.
+None of them fails: a root of what is negative, and what is divided by 0, is no number, NaN.  The root of 0 and the
+length of a vector of zeros have no slope.
 """
 
 from collections.abc import Sequence
