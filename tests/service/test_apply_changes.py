@@ -221,3 +221,18 @@ def test_changes_of_factors_have_the_same_bits_when_folded_again_and_after_a_che
                 assert [g.values.tobytes() for g in a.variables] == [g.values.tobytes() for g in b.variables]
     assert codes.count("underconstrained") == 1
     assert first.revision == second.revision == third.revision
+
+
+def test_what_an_insert_brings_of_new_kinds_is_bounded_with_changes_and_without() -> None:
+    map_solver, steps = make(), "".join(f"_{k}=multiply(_{k - 1},z);" for k in range(2, 20))
+    kind = "large{}(a:se2,z:50)=_1=multiply(z,dot(position(a),[1,2]));" + steps + "add(_19,_1)"
+    keys, upper = np.array([[symbol("x", 1)]]), np.eye(50)[np.triu_indices(50)][None]
+    group = [Factors(kind.format(n), keys, np.full((1, 50), 0.5), upper) for n in range(3)]
+    three, one = Batch(factors=tuple(group)), Batch(factors=(group[0],))
+    message = codec.encode_insert(Insert(7, three, changes=(weighed(0, 2.0),)))
+    with_change = read_insert(None, "a", message, REQUEST_LIMITS, 0.0)
+    assert isinstance(with_change, Arrived)
+    answers = []
+    for insert in (waiting(three, 6), with_change._replace(askers=[]), waiting(one, 8)):
+        answers += [each.answer for each in outcomes(came(map_solver, insert)[0])]
+    assert [getattr(answer, "code", "accepted") for answer in answers] == ["too_large", "too_large", "accepted"]

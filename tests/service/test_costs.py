@@ -9,7 +9,8 @@ import pytest
 
 from factorbus.proto import asking_codec, codec
 from factorbus.proto.asking import AskAssociate, AskCovariance, AskGain, AskGate, AskRepair, AskWhy
-from factorbus.proto.kinds import VARIABLE_KINDS
+from factorbus.proto.expressions.formula import read_formula
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import Problem, TooLarge
 from factorbus.proto.repair_codec import encode_ask_repair
@@ -21,6 +22,8 @@ from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver import Options, Solver
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.source import CovarianceSource
+from factorbus.solver.formulas.own_code import own_code_of
+from factorbus.solver.graph.own_kinds import bytes_to_compile
 
 POSES = 400
 INFORMATION = np.array([100.0, 0, 0, 100, 0, 400])
@@ -251,3 +254,18 @@ def test_what_is_lent_counts_for_all_until_it_is_given_back(memory: MemoryLimit)
     memory.reserve(memory.limit // 5)
     with pytest.raises(OutOfMemory):
         memory.reserve(memory.limit // 5)
+
+
+def test_an_insert_is_taken_where_there_is_memory_for_the_code_of_its_new_kinds(memory: MemoryLimit) -> None:
+    """Which its bytes do not show; what the process has made is not counted again."""
+    formula = "counted(a:vector9,z:9)=" + "subtract(multiply(" * 50 + "a" + ",z),z)" * 50
+    wanted = 12_000 * read_formula(formula).result_size
+    assert bytes_to_compile([formula, formula, "prior_se2"]) == wanted > 10 << 20
+    memory.look()
+    memory.limit = memory.resident + wanted // 2
+    assert memory.no_room(len(formula)) is None
+    assert isinstance(memory.no_room(len(formula), wanted), OutOfMemory)
+    memory.limit = memory.resident + 4 * wanted
+    assert memory.no_room(len(formula), wanted) is None
+    made = own_code_of(FACTOR_KINDS[formula].name)
+    assert bytes_to_compile([made.formula]) == 0

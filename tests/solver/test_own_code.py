@@ -157,6 +157,6 @@ def test_what_is_known_is_computed_as_code_is_made_whatever_it_is(known: str) ->
     try:
         solver = solved(f"known(a:vector1,z:1)=subtract(add(a,{known}),z)")
     except errors.NotFinite:
-        assert "[1e200]" in known or "wrap" in known
+        assert "[1e200]" in known or "wrap" in known or "sqrt([-1])" in known
         return
     assert np.isfinite(value_in(solver))

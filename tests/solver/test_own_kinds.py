@@ -9,6 +9,7 @@ from naive.own_formulas import OWN, both
 from naive.solver_parts import graph_in, keys_in
 
 from factorbus.client.expressions import SE2, SE3, Point3, Vector, factor, norm, sqrt
+from factorbus.proto.expressions.formula import read_formula
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
@@ -233,3 +234,61 @@ def test_where_the_residual_stops_being_a_number_the_factor_counts_for_nothing()
     report = solver.step(settle=True)
     assert np.isfinite(report.chi2)
     assert np.isfinite(values_of(solver)[x][1]).all()
+
+
+def large(n: int, numbers: int = 1000) -> Batch:
+    """A factor of a kind whose nodes have results of that many numbers."""
+    steps = "".join(f"_{k}=multiply(_{k - 1},z);" for k in range(2, numbers // 50))
+    name = f"large{n}(a:vector1,z:50)=_1=multiply(z,a);{steps}add(_{numbers // 50 - 1},_1)"
+    keys, upper = np.array([[symbol("b", 0)]]), np.eye(50)[np.triu_indices(50)][None]
+    return Batch((), (Factors(name, keys, np.full((1, 50), 0.5), upper),))
+
+
+def joined(*batches: Batch) -> Batch:
+    return Batch((), tuple(group for batch in batches for group in batch.factors))
+
+
+def test_what_is_new_in_one_insert_or_question_and_what_a_map_has_is_bounded() -> None:
+    solver = Solver()
+    solver.stage(with_range(bias_of_range.name))
+    solver.step()
+    assert read_formula(large(0).factors[0].kind).result_size == 1000
+    two, three = joined(large(0), large(1)), joined(large(0), large(1), large(2))
+    solver.check_new_kinds(two)
+    blocks = CovarianceBlocks(solver.covariances.factored())
+    why = r"has 3000 .* that are new, the limit is 2048; send new kinds in several"
+    with pytest.raises(errors.TooLarge, match=why):
+        solver.check_new_kinds(three)
+    with pytest.raises(errors.TooLarge, match=why):
+        evaluate_candidates(blocks, three.factors)
+    solver.stage(two)
+    solver.check_new_kinds(three)
+    for n in range(2, 8):
+        solver.stage(large(n))
+    with pytest.raises(errors.TooLarge, match="8192; remove the factors of a kind, or write as z"):
+        solver.stage(large(8))
+
+
+def test_a_change_makes_room_for_the_kinds_of_its_insert() -> None:
+    """As it removes the last factor of a name, or one of as many kinds as there may be."""
+    solver = Solver()
+    solver.stage(with_range(bias_of_range.name))
+    solver.step()
+    keys = np.array([[symbol("x", 0), symbol("l", 0), symbol("b", 0)]])
+
+    def named(name: str, factor: float = 1.0) -> Batch:
+        formula = f"{name}(a:se3,l:point3,b:vector1,z:1)=subtract(multiply(norm(act(a,l)),{factor}),add(b,z))"
+        return Batch((), (Factors(formula, keys, np.array([[2.0]]), np.array([[1.0]])),))
+
+    for n in range(MOST_OWN - 1):
+        solver.stage(named(f"k{n}"))
+    solver.step()
+    gone = (Change("remove_factors", factors=np.array([solver.factor_count - 1])),)
+    with pytest.raises(errors.TooLarge, match="257 own kinds, the limit is 256; remove the factors of a kind"):
+        try_change(solver, (Change("weigh", factors=np.array([0]), weight=np.ones(1)),), named("more"))
+    for batch in (named("more"), named(f"k{MOST_OWN - 2}", 2.0)):
+        came = try_change(solver, gone, batch)
+        after = solver if came else with_changes(solver, gone, batch)[0]
+        assert FACTOR_KINDS[batch.factors[0].kind].name in graph_in(after).own
+        assert after.factor_count == solver.factor_count
+        assert len(graph_in(after).own) == MOST_OWN

@@ -24,6 +24,7 @@ from contextlib import closing
 from typing import Any
 
 from factorbus.proto import codec, keys
+from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Internal, Problem, UnknownQuestion
 from factorbus.proto.protocol import known
 from factorbus.proto.version import __version__
@@ -57,6 +58,7 @@ from factorbus.service.questions.answers import Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.registry import Maps
 from factorbus.service.solving.arrival import read_insert
+from factorbus.solver.graph.own_kinds import bytes_to_compile
 
 log = logging.getLogger(__name__)
 
@@ -219,7 +221,9 @@ class Shell:
             found.host.unread(client, read)
             return
         self._senders.remember(key, sender)
-        if (full := self.health_report.memory.no_room(read.size)) is not None:
+        content = read.content
+        code = bytes_to_compile(group.kind for group in content.batch.factors) if isinstance(content, Insert) else 0
+        if (full := self.health_report.memory.no_room(read.size, code)) is not None:
             read = read._replace(content=full, message=b"")
         found.host.insert(read)
 

@@ -86,10 +86,8 @@ class BadOption(SolverError):
 class TooLarge(SolverError):
     code = "too_large"
 
-    def __init__(self, what: str, size: int, limit: int, unit: str) -> None:
-        super().__init__(
-            f"{what} has {size} {unit}, the limit is {limit}; ask for less at a time", size=size, limit=limit
-        )
+    def __init__(self, what: str, size: int, limit: int, unit: str, mend: str = "ask for less at a time") -> None:
+        super().__init__(f"{what} has {size} {unit}, the limit is {limit}; {mend}", size=size, limit=limit)
 
 
 class NoBackend(SolverError):

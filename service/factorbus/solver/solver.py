@@ -16,6 +16,7 @@ from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.columns import Columns
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import BatchLike, FactorGroup, Group
+from factorbus.solver.graph.own_kinds import check_new_kinds
 from factorbus.solver.inc_l.steps import STATE_TYPES, IncrementalSteps
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
@@ -57,6 +58,10 @@ class Solver:
     def factor_count(self) -> int:
         """Factors, the staged ones included."""
         return self._graph.factor_count
+
+    def check_new_kinds(self, batch: BatchLike) -> None:
+        """Raises TooLarge: to compile the own kinds that are new in `batch` takes longer than a step may."""
+        check_new_kinds(self._graph, batch)
 
     def stage(self, batch: BatchLike | Columns) -> int:
         """Check `batch`, take it in, and give values to its variables that have none; gives the id of its first factor.

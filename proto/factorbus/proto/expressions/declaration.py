@@ -68,6 +68,11 @@ class Declaration:
         """How many numbers the residual has."""
         return value_size(self.types[-1])
 
+    @cached_property
+    def result_size(self) -> int:
+        """How many numbers the values of all nodes have: what it costs to compile goes with it."""
+        return sum(map(value_size, self.types[len(self.variables) + 1 :]))
+
     @property
     def scalars(self) -> int:
         """How many numbers a change of all variables has."""

@@ -141,6 +141,11 @@ def _cross(_kinds: Sequence[Type], _numbers: Sequence[int], a: F64, b: F64) -> A
     return np.cross(a, b) if len(a) == 3 else a[0] * b[1] - a[1] * b[0]
 
 
+def _over(a: F64, b: F64) -> F64:
+    """a / b; no number where b is 0."""
+    return a * (np.nan if b[0] == 0.0 else 1.0 / b[0])
+
+
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
     """An operation that looks at values alone."""
     return lambda _kinds, _numbers, *of: function(*of)
@@ -154,7 +159,7 @@ _DO: dict[str, Callable[..., Any]] = {
     "position": lambda kinds, _numbers, a: a[: 2 if kinds[0] == SE2 else 3],
     "rotation": _plain(lambda a: a[3:]),
     "heading": _plain(lambda a: a[2:]),
-    "pose": _plain(lambda a, b: np.concatenate([a, b])),
+    "pose": _plain(lambda a, b: np.concatenate([a, _wrap(b) if len(a) == 2 else b])),
     "log": _logarithm,
     "exp": _plain(_exp),
     "vector_part": _plain(lambda a: _positive(a)[:3]),
@@ -171,7 +176,7 @@ _DO: dict[str, Callable[..., Any]] = {
     "subtract": _plain(np.subtract),
     "negate": _plain(np.negative),
     "multiply": _plain(np.multiply),
-    "divide": _plain(np.divide),
+    "divide": _plain(_over),
     "part": lambda _kinds, numbers, a: a[numbers[0] : numbers[0] + numbers[1]],
     "vector": _plain(lambda *all_of: np.concatenate(all_of)),
 }

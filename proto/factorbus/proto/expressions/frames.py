@@ -1,57 +1,64 @@
-"""What an own kind says of the map's frame: nothing, if its residual is the same wherever the map lies."""
+"""What an own kind says of the map's frame: nothing, if its residual is the same wherever the map lies.
+
+It is so where that is proven of the formula (`exact`): its residual, both sides of each `select`, and all that it takes
+roots of or divides by, are the same numbers before and after a motion of the map.  Whatever is not proven says where
+its variables are.
+"""
 
 from functools import lru_cache
 from itertools import combinations
-
-import numpy as np
+from typing import Any
 
 from factorbus.proto.expressions.declaration import Declaration
-from factorbus.proto.expressions.evaluate import F64, compose_group, evaluate, move_point, random_value
+from factorbus.proto.expressions.exact import Exact, ExactArithmetic, NotProven, compose_exact, move_exact
+from factorbus.proto.expressions.operations import SE2, SE3, SO3
 
-_TRIES = 3  # random values and motions
-_ROUNDING = 1e-9
 _MOST_LEFT_OUT = 2  # variables that are on a robot and do not move with the map
-_PLANE, _SPACE = ("se2", "point2"), ("se3", "point3", "so3")
+_MOST_PAIRS_OF = 8  # poses and points: of more than that at most one is left out
+_PLANE, _SPACE = ("se2", "point2"), ("se3", "point3", "so3", "idp")
+_FEATURE = "idp"  # moves with the map whatever else does
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=1024)
 def moving_ends(declared: Declaration) -> tuple[int, ...] | None:
     """Which variables move with the map's frame, as all but the mount of a sensor do; None: it says where they are.
 
-    Found by moving them: the most poses and points that can be moved together with the residual staying as it is.
+    The most poses and points of which it is proven that the residual stays as it is where they move together.
     """
-    ends = [n for n, (_, kind) in enumerate(declared.variables) if kind in (*_PLANE, *_SPACE)]
+    kinds = [kind for _, kind in declared.variables]
+    ends = [n for n, kind in enumerate(kinds) if kind in (*_PLANE, *_SPACE)]
     if not ends:
         return ()
-    for left_out in range(min(_MOST_LEFT_OUT, len(ends) - 1) + 1):
-        for stay in combinations(reversed(ends), left_out):
-            moving = tuple(n for n in ends if n not in stay)
-            if all(_stays(declared, moving, seed) for seed in range(_TRIES)):
-                return moving
+    may_stay = [n for n in reversed(ends) if kinds[n] != _FEATURE]
+    most = _MOST_LEFT_OUT if len(ends) <= _MOST_PAIRS_OF else 1
+    of = ExactArithmetic(declared)
+    try:
+        before = _values(of)
+        unmoved = of.carry_out(before)
+        for left_out in range(min(most, len(ends) - 1) + 1):
+            for stay in combinations(may_stay, left_out):
+                moving = tuple(n for n in ends if n not in stay)
+                after = [_moved(of, kinds[n], x) if n in moving else x for n, x in enumerate(before)]
+                if of.carry_out(after) == unmoved:
+                    return moving
+    except NotProven:
+        pass
     return None
 
 
-def _stays(declared: Declaration, moving: tuple[int, ...], seed: int) -> bool:
-    rng = np.random.default_rng(seed)
-    values = [random_value(kind, rng) for kind in declared.types[: len(declared.variables)]]
-    z, motions = (
-        random_value(declared.measured, rng),
-        {"plane": random_value("se2", rng), "space": random_value("se3", rng)},
-    )
-    moved = [
-        _moved(kind, value, motions) if n in moving else value
-        for n, ((_, kind), value) in enumerate(zip(declared.variables, values, strict=True))
-    ]
-    with np.errstate(all="ignore"):
-        before, after = evaluate(declared, values, z), evaluate(declared, moved, z)
-        alike = np.abs(after - before) <= _ROUNDING * (1.0 + np.abs(before))
-    return bool((alike | (np.isnan(before) & np.isnan(after))).all())
+def _values(of: ExactArithmetic) -> list[Any]:
+    """Of the variables and of z."""
+    declared = of.declared
+    return [of.random_value(kind, n) for n, kind in enumerate(declared.types[: len(declared.variables) + 1])]
 
 
-def _moved(kind: str, value: F64, motions: dict[str, F64]) -> F64:
-    group, motion = ("se2", motions["plane"]) if kind in _PLANE else ("se3", motions["space"])
-    if kind.startswith("point"):
-        return move_point(group, motion, value)
-    if kind == "so3":
-        return compose_group("so3", motion[3:], value)
-    return compose_group(group, motion, value)
+def _moved(of: ExactArithmetic, kind: str, value: Any) -> Any:
+    """Where the motion of the map takes a variable: one motion for all in the plane, another for all in space."""
+    motion = of.random_value(SE2 if kind in _PLANE else SE3, "motion")
+    if kind in (SE2, SE3):
+        return compose_exact(of, motion, value)
+    if kind == SO3:
+        return compose_exact(of, motion.quaternion, value)
+    where = of.plain(move_exact(of, motion, [x.number for x in value[: 2 if kind in _PLANE else 3]]))
+    # Of a feature the direction turns, which is enough to know: any other angles.
+    return [*where, Exact(of.some("theta")), Exact(of.some("phi")), value[5]] if kind == _FEATURE else where

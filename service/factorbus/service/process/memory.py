@@ -62,13 +62,16 @@ class MemoryLimit:
         self._promised = 0
         self.resident = self._measure()
 
-    def no_room(self, size: int) -> OutOfMemory | None:
-        """Why an insert of `size` bytes cannot be taken; None: it can."""
-        self._promised += _GROWTH * size
+    def no_room(self, size: int, beside: int = 0) -> OutOfMemory | None:
+        """Why an insert of `size` bytes cannot be taken, for which `beside` bytes are needed that it does not show by
+        its size; None: it can.
+        """
+        more = _GROWTH * size + beside
+        self._promised += more
         if self.resident + self._promised <= self.limit:
             return None
         self.look()
-        if self.resident + _GROWTH * size <= self.limit:
+        if self.resident + more <= self.limit:
             return None
         return OutOfMemory(self.resident, self.limit)
 

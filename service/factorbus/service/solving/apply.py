@@ -259,6 +259,7 @@ class MapSolver(Holding):
         if isinstance(content, Problem):
             raise content
         counts = self._check_room(counts, content.batch.variable_count, content.batch.factor_count)
+        self._solver.check_new_kinds(content.batch)
         return self._solver.stage(content.batch), counts
 
     def _check_room(self, counts: tuple[int, int], variables: int, factors: int) -> tuple[int, int]:
@@ -309,6 +310,7 @@ class MapSolver(Holding):
             if self._broken:
                 raise Broken(self._broken)
             self._check_room(self._accepted_counts, content.batch.variable_count, content.batch.factor_count)
+            self._solver.check_new_kinds(content.batch)
             # Numbers of unusual sizes are tried on another solver, as they are by inserts.
             came = None if self._wary else try_change(self._solver, content.changes, content.batch, content.settle)
         except (Problem, SolverError) as problem:

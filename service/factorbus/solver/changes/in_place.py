@@ -7,7 +7,7 @@ import numpy as np
 from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.changes.factor_edit import FactorEdit
 from factorbus.solver.changes.requested import Edits
-from factorbus.solver.errors import SolverError
+from factorbus.solver.errors import KindTaken, SolverError, TooLarge
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model.bounds import find_escaped
@@ -29,7 +29,12 @@ def try_in_place(
     edit = FactorEdit(graph, steps.tree, edits)
     if not edit.is_possible:
         return None
-    first = stage()
+    try:
+        first = stage()
+    except (KindTaken, TooLarge):
+        if not edit.gone.size:
+            raise
+        return None  # what is removed may be what stands in the way: a solver of what is left says
     count = edit.gone.size, edit.members
     steps.rebase(*count)
     try:

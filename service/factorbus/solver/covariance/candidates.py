@@ -16,6 +16,7 @@ from factorbus.solver.graph.factor_rows import are_of_many, is_first
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.groups import FactorsLike
 from factorbus.solver.graph.linearized import linearized_factor
+from factorbus.solver.graph.own_kinds import check_new_kinds
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.candidates import evaluate_factors
@@ -66,9 +67,10 @@ def evaluate_candidates(blocks: CovarianceBlocks, groups: Sequence[FactorsLike])
 @contextmanager
 def admitted(graph: FactorGraph, groups: Sequence[FactorsLike]) -> Iterator[None]:
     """`groups` are the last factors of `graph` for a while.  Raises as `evaluate_candidates`."""
-    mark = graph.mark()
+    mark, batch = graph.mark(), _Batch((), tuple(groups))
+    check_new_kinds(graph, batch)
     try:
-        admit(graph, _Batch((), tuple(groups)))
+        admit(graph, batch)
         yield
     finally:
         graph.forget(mark)

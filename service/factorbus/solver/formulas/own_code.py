@@ -18,6 +18,7 @@ from factorbus.solver.kernels.model import expression_layout as at
 
 # Whose graphs are gone are kept for a while: what a graph was copied from may still be read.
 _KEPT = 256
+_LESS = "drop a map that has others, or use another service"
 
 
 class OwnCode:
@@ -65,7 +66,12 @@ def own_code_of(formula: str) -> OwnCode:
         try:
             return _made(formula)
         except TooManyFunctions:
-            raise errors.TooLarge("the process", len(_THERE) + 1, len(_THERE), "own kinds") from None
+            raise errors.TooLarge("the process", len(_THERE) + 1, len(_THERE), "own kinds", _LESS) from None
+
+
+def is_made(formula: str) -> bool:
+    """Whether the process has its code."""
+    return formula in _THERE
 
 
 @lru_cache(maxsize=256)

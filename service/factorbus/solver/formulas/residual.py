@@ -18,7 +18,7 @@ from factorbus.proto.expressions.declaration import CONSTANT, Declaration, Expre
 from factorbus.proto.expressions.operations import SO3, Type, tangent_size, value_size
 from factorbus.solver.formulas import groups, vectors
 from factorbus.solver.formulas.groups import Dual
-from factorbus.solver.formulas.terms import DOUBLE, INTEGER, LANES, WIDE, Code, Operand, Term
+from factorbus.solver.formulas.terms import DOUBLE, INTEGER, LANES, NO_SLOPE, WIDE, Code, Operand, Term
 from factorbus.solver.kernels.jit.compile import ir
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.expressions import BOTH, NO_NUMBER, RESIDUAL
@@ -53,7 +53,7 @@ def residual_code(declared: Declaration) -> str:
         known.append(Dual(_loaded(code, x, place, value_size(kind)), d))
         scalar += tangent_size(kind)
     measured = declared.measured
-    known.append(Dual(_loaded(code, z, INTEGER(0), value_size(measured)), [0.0] * tangent_size(measured)))
+    known.append(Dual(_loaded(code, z, INTEGER(0), value_size(measured)), [NO_SLOPE] * tangent_size(measured)))
 
     # 2. Each node of those before it.
     for node in declared.nodes:
@@ -123,7 +123,7 @@ def _is_within(code: Code, builder: Any, value: Any, kind: Any) -> Any:
 
 def _carry_out(node: ExpressionNode, kinds: Sequence[Type], of: Sequence[Dual]) -> Dual:
     if node.operation == CONSTANT:
-        return Dual(list(node.numbers), [0.0] * len(node.numbers))
+        return Dual(list(node.numbers), [NO_SLOPE] * len(node.numbers))
     return _DO[node.operation](kinds, [int(number) for number in node.numbers], *of)
 
 

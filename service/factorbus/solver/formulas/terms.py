@@ -1,8 +1,9 @@
 """Numbers of a formula while its code is made: an operator adds an instruction, once for the same operands.
 
 A term is a number, or one that a vector register has for several scalars of the variables at once: a slope.  What is
-known is computed here; a slope that is 0 needs no instruction, and neither does what is multiplied by it.  What is
-divided by what may be known is divided by `over`: numbers of Python raise where one is 0.
+known is computed here; a slope that there is none of, NO_SLOPE, needs no instruction, and neither does what is
+multiplied by it.  A number is multiplied by 0 all the same if it may be none: 0 · NaN is NaN.  What is divided by what
+may be known is divided by `over`: numbers of Python raise where one is 0.
 """
 
 from __future__ import annotations
@@ -25,6 +26,33 @@ _FOLDED = {
 
 Operand: TypeAlias = "Term | float"
 
+# In magnitude: what variables and measurements are within, and from where on a product may overflow.
+LOADED, _MAY_OVERFLOW = 1e12, 1e300
+
+
+class _NoSlope(float):
+    """0, also where it is multiplied by what is no number."""
+
+    def __mul__(self, _other: object) -> _NoSlope:
+        return self
+
+    __rmul__ = __truediv__ = __mul__
+
+    def __add__(self, other: Any) -> Any:
+        return other
+
+    __radd__ = __rsub__ = __add__
+
+    def __sub__(self, other: Any) -> Any:
+        return -other
+
+    def __neg__(self) -> _NoSlope:
+        return self
+
+
+# What does not change with the variables has this slope.
+NO_SLOPE = _NoSlope(0.0)
+
 
 class Code:
     """Where instructions go: those of numbers to one builder, those of slopes to another."""
@@ -34,21 +62,27 @@ class Code:
         self._made: dict[tuple[Any, ...], Term] = {}
 
     def number(self, value: Any) -> Term:
-        """A number that an instruction gave."""
-        return Term(self, value, False)
+        """A number that was loaded."""
+        return Term(self, value, False, LOADED)
 
     def slope(self, value: Any) -> Term:
         """Slopes that an instruction gave."""
         return Term(self, value, True)
 
-    def once(self, operation: str, wide: bool, operands: tuple[Operand, ...], make: Any) -> Term:
-        """What `make(builder, values of the operands)` gives, made once."""
+    def once(
+        self, operation: str, wide: bool, operands: tuple[Operand, ...], make: Any, most: float = math.inf
+    ) -> Term:
+        """What `make(builder, values of the operands)` gives, at most `most`, made once."""
         key = (operation, wide, *(_identity(operand) for operand in operands))
         if key not in self._made:
             builder = self.slopes if wide else self.numbers
             values = [self._value(operand, wide) for operand in operands]
-            self._made[key] = Term(self, make(builder, values), wide)
+            self._made[key] = Term(self, make(builder, values), wide, most)
         return self._made[key]
+
+    def is_made(self, operation: str, wide: bool, operands: tuple[Operand, ...]) -> bool:
+        """Whether that has been asked for before."""
+        return (operation, wide, *(_identity(operand) for operand in operands)) in self._made
 
     def function(self, name: str, arguments: int) -> Any:
         """A function of the C library, or of LLVM, of that number of numbers."""
@@ -74,12 +108,15 @@ class Code:
 
 
 class Term:
-    """A number, or slopes (`wide`), with its instruction's value."""
+    """A number, or slopes (`wide`), with its instruction's value.
 
-    __slots__ = ("code", "value", "wide")
+    most: what it is within, if it was made of numbers; infinite: it may be none.
+    """
 
-    def __init__(self, code: Code, value: Any, wide: bool) -> None:
-        self.code, self.value, self.wide = code, value, wide
+    __slots__ = ("code", "most", "value", "wide")
+
+    def __init__(self, code: Code, value: Any, wide: bool, most: float = math.inf) -> None:
+        self.code, self.value, self.wide, self.most = code, value, wide, most
 
     def __add__(self, other: Operand) -> Operand:
         return plus(self, other)
@@ -106,7 +143,7 @@ class Term:
         return over(other, self)
 
     def __neg__(self) -> Operand:
-        return self.code.once("fneg", self.wide, (self,), lambda builder, of: builder.fneg(*of, flags=_MAY))
+        return self.code.once("fneg", self.wide, (self,), lambda builder, of: builder.fneg(*of, flags=_MAY), self.most)
 
 
 def _identity(operand: Operand) -> Any:
@@ -117,12 +154,23 @@ def _is(operand: Operand, number: float) -> bool:
     return not isinstance(operand, Term) and operand == number
 
 
+def _most(operand: Operand) -> float:
+    if isinstance(operand, Term):
+        return operand.most
+    return abs(operand) if math.isfinite(operand) else math.inf
+
+
 def _instruction(name: str, a: Operand, b: Operand) -> Operand:
     terms = [operand for operand in (a, b) if isinstance(operand, Term)]
     if not terms:
         return _FOLDED[name](a, b)
-    wide = any(term.wide for term in terms)
-    return terms[0].code.once(name, wide, (a, b), lambda builder, of: getattr(builder, name)(*of, flags=_MAY))
+    wide, most = any(term.wide for term in terms), math.inf
+    if name != "fdiv":
+        most = _most(a) * _most(b) if name == "fmul" else _most(a) + _most(b)
+        most = most if most < _MAY_OVERFLOW else math.inf
+    if name == "fmul" and terms[0].code.is_made(name, wide, (b, a)):
+        a, b = b, a
+    return terms[0].code.once(name, wide, (a, b), lambda builder, of: getattr(builder, name)(*of, flags=_MAY), most)
 
 
 def plus(a: Operand, b: Operand) -> Operand:
@@ -132,13 +180,21 @@ def plus(a: Operand, b: Operand) -> Operand:
 
 def minus(a: Operand, b: Operand) -> Operand:
     """a − b"""
+    if a is b and isinstance(a, Term) and math.isfinite(a.most):
+        return 0.0  # else the processor may take a product from itself before that is rounded
     return -b if _is(a, 0.0) else a if _is(b, 0.0) else _instruction("fsub", a, b)
 
 
 def times(a: Operand, b: Operand) -> Operand:
-    """a b; 0 where one of them is always 0."""
-    if _is(a, 0.0) or _is(b, 0.0):
-        return 0.0
+    """a b; NO_SLOPE where one of them is, or a slope is taken 0 times."""
+    if a is NO_SLOPE or b is NO_SLOPE:
+        return NO_SLOPE
+    for zero, other in ((a, b), (b, a)):
+        if _is(zero, 0.0) and isinstance(other, Term):
+            if other.wide:
+                return NO_SLOPE
+            if math.isfinite(other.most):
+                return 0.0
     if _is(a, 1.0) or _is(a, -1.0):
         return b if _is(a, 1.0) else -b
     if _is(b, 1.0) or _is(b, -1.0):
@@ -147,14 +203,21 @@ def times(a: Operand, b: Operand) -> Operand:
 
 
 def over(a: Operand, b: Operand) -> Operand:
-    """a / b; 0 where a is always 0, though b may be too."""
+    """a / b; NO_SLOPE where a is."""
+    if a is NO_SLOPE:
+        return NO_SLOPE
     if isinstance(a, Term) or isinstance(b, Term):
-        return 0.0 if _is(a, 0.0) else a if _is(b, 1.0) else _instruction("fdiv", a, b)
+        return a if _is(b, 1.0) else _instruction("fdiv", a, b)
     return a / b if b != 0.0 else math.nan
 
 
+def reciprocal(a: Operand) -> Operand:
+    """1 / a; NaN where a is 0."""
+    return pick(a, "==", 0.0, math.nan, over(1.0, a))
+
+
 def root(a: Operand) -> Operand:
-    """√a of what is not negative."""
+    """√a; NaN where a is negative."""
     if not isinstance(a, Term):
         return math.sqrt(a) if a >= 0.0 else math.nan
     return _call("llvm.sqrt.f64", a)
@@ -162,17 +225,17 @@ def root(a: Operand) -> Operand:
 
 def sine(a: Operand) -> Operand:
     """sin a"""
-    return _call("sin", a) if isinstance(a, Term) else math.sin(a) if math.isfinite(a) else math.nan
+    return _call("sin", a, most=1.0) if isinstance(a, Term) else math.sin(a) if math.isfinite(a) else math.nan
 
 
 def cosine(a: Operand) -> Operand:
     """cos a"""
-    return _call("cos", a) if isinstance(a, Term) else math.cos(a) if math.isfinite(a) else math.nan
+    return _call("cos", a, most=1.0) if isinstance(a, Term) else math.cos(a) if math.isfinite(a) else math.nan
 
 
 def angle_of(y: Operand, x: Operand) -> Operand:
     """The angle of (x, y)."""
-    return _call("atan2", y, x) if isinstance(y, Term) or isinstance(x, Term) else math.atan2(y, x)
+    return _call("atan2", y, x, most=math.pi) if isinstance(y, Term) or isinstance(x, Term) else math.atan2(y, x)
 
 
 def floor(a: Operand) -> Operand:
@@ -183,16 +246,22 @@ def floor(a: Operand) -> Operand:
 def pick(a: Operand, comparison: str, b: Operand, yes: Operand, no: Operand) -> Operand:
     """`yes` where a `comparison` b, of numbers, else `no`; `yes` and `no` are numbers or slopes."""
     if not isinstance(a, Term) and not isinstance(b, Term):
-        return yes if {"<": a < b, ">=": a >= b, ">": a > b}[comparison] else no
+        return yes if {"<": a < b, ">=": a >= b, ">": a > b, "==": a == b}[comparison] else no
     if not isinstance(yes, Term) and not isinstance(no, Term) and yes == no:
-        return yes  # zeros of either sign too: a slope that is 0 is none
+        return NO_SLOPE if no is NO_SLOPE else yes  # also of zeros of either sign
     code = next(term.code for term in (a, b) if isinstance(term, Term))
     holds = code.once(f"fcmp {comparison}", False, (a, b), lambda builder, of: builder.fcmp_ordered(comparison, *of))
     wide = any(isinstance(term, Term) and term.wide for term in (yes, no))
-    key = (yes, no)
-    return code.once(f"select {id(holds.value)}", wide, key, lambda builder, of: builder.select(holds.value, *of))
+    key, most = (yes, no), max(_most(yes), _most(no))
+    return code.once(f"select {id(holds.value)}", wide, key, lambda builder, of: builder.select(holds.value, *of), most)
 
 
-def _call(name: str, *of: Operand) -> Operand:
+def _call(name: str, *of: Operand, most: float = math.inf) -> Operand:
+    """most: of what it gives for numbers."""
     code = next(term.code for term in of if isinstance(term, Term))
-    return code.once(name, False, of, lambda builder, values: builder.call(code.function(name, len(values)), values))
+    most = most if all(math.isfinite(_most(each)) for each in of) else math.inf
+
+    def make(builder: Any, values: Any) -> Any:
+        return builder.call(code.function(name, len(values)), values)
+
+    return code.once(name, False, of, make, most)

@@ -1,13 +1,25 @@
 """Operations of vectors and numbers: the numbers of the result, and its slopes.  MATH §3.11.
 
-None of them fails: a root of what is negative is 0 and has no slope, as the length of a vector of zeros has none.
+None of them fails: a root of what is negative, and what is divided by 0, is no number, NaN.  The root of 0 and the
+length of a vector of zeros have no slope.
 """
 
 from collections.abc import Sequence
 from functools import reduce
 
 from factorbus.solver.formulas.groups import Dual, cross_product
-from factorbus.solver.formulas.terms import Operand, angle_of, cosine, over, pick, plus, root, sine
+from factorbus.solver.formulas.terms import (
+    NO_SLOPE,
+    Operand,
+    angle_of,
+    cosine,
+    over,
+    pick,
+    plus,
+    reciprocal,
+    root,
+    sine,
+)
 
 
 def _inner(a: Sequence[Operand], b: Sequence[Operand]) -> Operand:
@@ -17,7 +29,7 @@ def _inner(a: Sequence[Operand], b: Sequence[Operand]) -> Operand:
 def norm(a: Dual) -> Dual:
     """‖a‖:  δ = aᵀ δa / ‖a‖."""
     length = root(_inner(a.v, a.v))
-    return Dual([length], [pick(length, ">", 0.0, over(_inner(a.v, a.d), length), 0.0)])
+    return Dual([length], [pick(length, "==", 0.0, NO_SLOPE, over(_inner(a.v, a.d), length))])
 
 
 def dot(a: Dual, b: Dual) -> Dual:
@@ -37,14 +49,14 @@ def atan2(a: Dual, b: Dual) -> Dual:
     """The angle of (b, a):  δ = (b δa − a δb) / (a² + b²)."""
     y, x = a.v[0], b.v[0]
     square = x * x + y * y
-    along, across = (pick(square, ">", 0.0, over(part, square), 0.0) for part in (x, y))
+    along, across = (pick(square, "==", 0.0, 0.0, over(part, square)) for part in (x, y))
     return Dual([angle_of(y, x)], [along * a.d[0] - across * b.d[0]])
 
 
 def sqrt(a: Dual) -> Dual:
     """√a."""
-    value = root(pick(a.v[0], ">", 0.0, a.v[0], 0.0))
-    return Dual([value], [pick(value, ">", 0.0, over(0.5, value), 0.0) * a.d[0]])
+    value = root(a.v[0])
+    return Dual([value], [pick(value, "==", 0.0, 0.0, over(0.5, value)) * a.d[0]])
 
 
 def sin(a: Dual) -> Dual:
@@ -73,6 +85,6 @@ def multiply_dual(a: Dual, b: Dual) -> Dual:
 
 def divide(a: Dual, b: Dual) -> Dual:
     """a / b, a number:  δ = (δa − (a / b) δb) / b."""
-    by = over(1.0, b.v[0])
+    by = reciprocal(b.v[0])
     value = [x * by for x in a.v]
     return Dual(value, [by * (d - x * b.d[0]) for x, d in zip(value, a.d, strict=True)])

@@ -1,8 +1,11 @@
 """Kinds that clients wrote themselves: which of them a map has, and have their residuals values?  MATH §3.11."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from factorbus.solver import errors
+from factorbus.solver.formulas.own_code import is_made
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.graph.groups import BatchLike
@@ -10,6 +13,13 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.own_residuals import find_without_residual
 
 MOST_OWN = 256  # kinds of a map
+# Numbers of the results of their nodes, which take 0.5 to 1.3 ms each to compile: of those that are new in one insert,
+# and of all of a map, which a restart compiles.
+MOST_NEW_RESULTS, MOST_RESULTS_OF_MAP = 2048, 8192
+# Of memory that a process has for such a number once it is compiled, most of it LLVM's; measured, 5 to 18 kB.
+_BYTES_OF_RESULT = 12_000
+_RESULTS = "numbers in the results of own kinds"
+_FEWER = "remove the factors of a kind, or write as z what differs between kinds"
 
 
 def take_own_kinds(graph: FactorGraph, batch: BatchLike) -> None:
@@ -17,9 +27,7 @@ def take_own_kinds(graph: FactorGraph, batch: BatchLike) -> None:
 
     Raises KindTaken: one of them is called as another of the map; TooLarge: the map would have too many.
     """
-    names = {FACTOR_KINDS[group.kind].name: None for group in batch.factors if "(" in group.kind and len(group.keys)}
-    new = [name for name in names if name not in graph.own]
-    if not new:
+    if not (new := _new_kinds(graph, batch)):
         return
     held = {_called(name): name for name in graph.own}
     if any(_called(name) in held for name in new):
@@ -29,11 +37,27 @@ def take_own_kinds(graph: FactorGraph, batch: BatchLike) -> None:
         if before != name:
             raise errors.KindTaken(_called(name), before, name)
     kept = tuple(name for name in graph.own if held.get(_called(name)) == name)
-    if len(kept) + len(new) > MOST_OWN:  # those whose factors are gone, or never came, make room
-        kept = tuple(_in_use(graph))
-    if len(kept) + len(new) > MOST_OWN:
-        raise errors.TooLarge("the map", len(kept) + len(new), MOST_OWN, "own kinds")
-    graph.own = (*kept, *new)
+    with_new = [*kept, *new]
+    if len(with_new) > MOST_OWN or _results(with_new) > MOST_RESULTS_OF_MAP:
+        with_new = [*_in_use(graph), *new]  # those whose factors are gone, or never came, make room
+    if len(with_new) > MOST_OWN:
+        raise errors.TooLarge("the map with this", len(with_new), MOST_OWN, "own kinds", _FEWER)
+    if (results := _results(with_new)) > MOST_RESULTS_OF_MAP:
+        raise errors.TooLarge("the map with this", results, MOST_RESULTS_OF_MAP, _RESULTS, _FEWER)
+    graph.own = tuple(with_new)
+
+
+def check_new_kinds(graph: FactorGraph, batch: BatchLike) -> None:
+    """Raises TooLarge: to compile what own kinds `batch` brings that the map does not have takes too long."""
+    if (results := _results(_new_kinds(graph, batch))) > MOST_NEW_RESULTS:
+        mend = "send new kinds in several inserts, or ask for fewer at a time"
+        raise errors.TooLarge("this insert or question", results, MOST_NEW_RESULTS, f"{_RESULTS} that are new", mend)
+
+
+def bytes_to_compile(kinds: Iterable[str]) -> int:
+    """What the memory of the process may grow by as own kinds of these are compiled that it does not have."""
+    names = {FACTOR_KINDS[kind].name for kind in kinds if "(" in kind}
+    return _BYTES_OF_RESULT * _results(name for name in names if not is_made(name))
 
 
 def check_residuals(graph: FactorGraph, first: int) -> None:
@@ -43,6 +67,15 @@ def check_residuals(graph: FactorGraph, first: int) -> None:
         raise errors.NotFinite(
             f"the residual of {graph.describe(row)}, or its derivative, at the values it begins with"
         )
+
+
+def _new_kinds(graph: FactorGraph, batch: BatchLike) -> list[str]:
+    names = {FACTOR_KINDS[group.kind].name: None for group in batch.factors if "(" in group.kind and len(group.keys)}
+    return [name for name in names if name not in graph.own]
+
+
+def _results(names: Iterable[str]) -> int:
+    return sum(own.result_size for name in names if (own := FACTOR_KINDS[name].own))
 
 
 def _called(name: str) -> str:
