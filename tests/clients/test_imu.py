@@ -49,6 +49,8 @@ def test_samples_hold_until_the_next_and_are_cut_at_the_poses() -> None:
 
 
 MADE = preintegrate_samples(SAMPLES, NOISE)
+
+
 def test_samples_that_were_lost_are_not_bridged() -> None:
     """At 100 Hz, with none for 4 s in the middle, and none at the end."""
     times = np.concatenate([np.arange(0, 100), np.arange(500, 600)]) / 100
