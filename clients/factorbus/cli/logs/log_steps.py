@@ -29,7 +29,7 @@ class LogSteps(Sequence[Batch]):
     """The batches of a log, in order of time.  Raises FormatError."""
 
     def __init__(self, log: SensorLog) -> None:
-        self._log, self.times = log, moments(log)
+        self._log, self.times = log, pose_times(log)
         self._at = {name: _nearest(self.times, each.times) for name, each in _aids(log).items()}
         self.start = started(log, self.times)
         self._framed = log.fixes is not None and log.way is not None and log.way.relative
@@ -173,7 +173,7 @@ def samples_between(log: SensorLog, begin: int, end: int) -> F64:
     return cut_samples(seconds, log.imu.rates[rows, :3], log.imu.rates[rows, 3:], 0.0, (end - begin) * 1e-9)
 
 
-def moments(log: SensorLog) -> I64:
+def pose_times(log: SensorLog) -> I64:
     """The times of the poses (n,), n above 1.  Raises FormatError."""
     chosen, step = np.empty(0, np.int64), int(log.every_s * 1e9)
     for each in _aids(log).values():
