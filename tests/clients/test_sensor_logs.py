@@ -12,7 +12,7 @@ from bench.calibration import off
 from naive.dense_factors import boxminus
 from scipy.special import chdtri
 
-from factorbus.cli.logs.log_steps import moments
+from factorbus.cli.logs.log_steps import pose_times
 from factorbus.cli.logs.recognize import read_log
 from factorbus.cli.logs.write_euroc import ORIGIN, write_world
 from factorbus.cli.main import main
@@ -179,7 +179,7 @@ def test_no_two_poses_have_more_samples_between_than_a_factor_takes(tmp_path: Pa
         lines = file.read_text().splitlines()
         file.write_text("\n".join([*lines[:4], lines[-1]]) + "\n")
     log = read_log(tmp_path)
-    assert np.diff(np.searchsorted(log.imu.times, moments(log))).max() <= 1000
+    assert np.diff(np.searchsorted(log.imu.times, pose_times(log))).max() <= 1000
 
 
 def _line(number: int, text: str) -> Callable[[Path], None]:
