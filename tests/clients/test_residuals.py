@@ -30,6 +30,15 @@ def calibrated_steps(seed: int) -> Iterator[Batch]:
         yield Batch(batch.variables, tuple(group for group in batch.factors if group.kind != "point_seen_offset"))
 
 
+def gravity_steps(seed: int) -> Iterator[Batch]:
+    """How long gravity is, which is a variable."""
+    rng, keys = np.random.default_rng(seed), np.arange(4)
+    lengths = Factors("length_vector3", keys[:, None], rng.uniform(9.7, 9.9, (4, 1)), np.full((4, 1), 400.0))
+    linear = np.hstack([np.zeros((4, 3)), np.tile(np.eye(3).ravel(), (4, 1)), rng.normal(0, 9, (4, 3))])
+    held = Factors("linear_3_vector3", keys[:, None], linear, np.tile([1.0, 0, 0, 1, 0, 1], (4, 1)))
+    yield Batch((Variables("vector3", keys, rng.normal(0, 5, (4, 3))),), (lengths, held))
+
+
 WORLDS = [
     (random_steps, 1),
     (random_steps, 2),
@@ -39,6 +48,7 @@ WORLDS = [
     (sensor_steps, 1),
     (calibrated_steps, 1),
     (similar_steps, 1),
+    (gravity_steps, 1),
 ]
 
 

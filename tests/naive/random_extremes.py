@@ -12,11 +12,28 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
 MOST, MOST_INFORMATION = 1e12, 1e24
-SIZES = {"se2": 3, "se3": 7, "point2": 2, "point3": 3, "idp": 6, "vector1": 1, "vector2": 2, "vector3": 3, "vector9": 9}
+SIZES = {
+    "se2": 3,
+    "se3": 7,
+    "so3": 4,
+    "sim3": 8,
+    "point2": 2,
+    "point3": 3,
+    "idp": 6,
+    "vector1": 1,
+    "vector2": 2,
+    "vector3": 3,
+    "vector9": 9,
+}
+TURNED_AT = {"se3": 3, "so3": 0, "sim3": 3}  # where the quaternion is
+# Where a measured rotation or similarity has its quaternion.
+SIMILAR = {"prior_so3": 0, "between_so3": 0, "prior_sim3": 3, "between_sim3": 3}
 LOSSES = ("", "", "", "huber", "cauchy", "geman-mcclure", "tukey", "dcs")
 LETTERS = {
     "se2": "x",
     "se3": "y",
+    "so3": "r",
+    "sim3": "m",
     "point2": "l",
     "point3": "p",
     "idp": "f",
@@ -47,6 +64,11 @@ def quaternion(rng: np.random.Generator) -> np.ndarray:
     return q / np.linalg.norm(q)
 
 
+def scale(rng: np.random.Generator) -> float:
+    """Of a sim3, within what is admitted."""
+    return float(np.clip(10.0 ** rng.uniform(-12.5, 12.5), 1.0 / MOST, MOST))
+
+
 def value(kind: str, others: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     """Of a variable; at times where another one is, or next to it."""
     made = numbers(SIZES[kind], rng)
@@ -54,8 +76,10 @@ def value(kind: str, others: list[np.ndarray], rng: np.random.Generator) -> np.n
         near = others[int(rng.integers(len(others)))]
         n = min(2 if kind.endswith("2") else 3, near.size, made.size)
         made[:n] = near[:n] + rng.choice([0.0, 1e-200, 1e-12, 1.0]) * rng.normal(size=n)
-    if kind == "se3":
-        made[3:] = quaternion(rng)
+    if kind in TURNED_AT:
+        made[TURNED_AT[kind] : TURNED_AT[kind] + 4] = quaternion(rng)
+    if kind == "sim3":
+        made[7] = scale(rng)
     return np.clip(made, -MOST, MOST)
 
 
@@ -81,7 +105,12 @@ def measured(kind: str, rng: np.random.Generator) -> np.ndarray:
         z[:2] = rng.uniform(0, 500, 2) if rng.random() < 0.7 else numbers(2, rng)
         return z
     z = numbers(FACTOR_KINDS[kind].size, rng)
-    if kind.startswith(("range", "bearing_range")):
+    if kind in SIMILAR:
+        z[SIMILAR[kind] : SIMILAR[kind] + 4] = quaternion(rng)
+        if z.size == SIZES["sim3"]:
+            z[7] = scale(rng)
+        return z
+    if kind.startswith(("range", "bearing_range", "length")):
         z[-1] = abs(z[-1]) or 1.0
     at = 0
     for end in connects(kind) if kind.startswith("linear") else ["se3"] if z.size == 7 else []:
@@ -93,7 +122,7 @@ def measured(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 def connects(kind: str) -> list[str]:
     """The kinds of variables that a kind of factor is on."""
-    if is_derived(kind) or kind.startswith(("linear", "velocity")):
+    if is_derived(kind) or kind.startswith(("linear", "velocity", "length")):
         return CONNECTS[kind]
     if kind.startswith("prior_"):
         return [kind.removeprefix("prior_")]

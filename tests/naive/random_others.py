@@ -35,7 +35,7 @@ def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random
     if kind.startswith("linear"):
         return _random_linear(kind, ends, noise, rng)
     if kind == "length_vector3":
-        return np.array([np.linalg.norm(ends[0]) + noise * rng.normal()])
+        return np.array([abs(np.linalg.norm(ends[0]) + noise * rng.normal())])
     T = pose_matrix(ends[0])
     n = len(T) - 1
     if kind.startswith("velocity"):

@@ -102,13 +102,6 @@ REFUSED = {
     "range": (PLANE.replace("5.5 0.25", "0 0.25"), 10, "EDGE_RANGE of 0; wanted a distance above 0"),
     "itself": (PLANE.replace("A1 B0 6.5", "B0 B0 6.5"), 12, "EDGE_RANGE from B0 to itself"),
     "unknown": (PLANE.replace("A0 L0 5.5", "A0 L7 5.5"), 10, "EDGE_RANGE of L7, of which no other line tells"),
-    "undeclared": (
-        PLANE + "EDGE_SE2 0 A1 A9 1 0 0 1 0 0 1 0 1\n",
-        13,
-        "EDGE_SE2 of A9, of which there is no vertex line",
-    ),
-    "undeclared point": (PLANE.replace("VERTEX_XY L1 0 2\n", ""), 8, "EDGE_SE2_XY of L1, of which there is no vertex"),
-    "undeclared prior": (PLANE.replace("PRIOR 0 L0", "PRIOR 0 L9"), 7, "VERTEX_XY:PRIOR of L9, of which there is no"),
     "spaces": (PLANE + "VERTEX_XYZ L9 1 2 3\nEDGE_RANGE 0 A0 L9 1 1\n", 14, "EDGE_RANGE between se2 and point3"),
     "kinds": (PLANE + "VERTEX_XY A0 1 2\n", 13, "as a 2D point"),
     "times": (PLANE + "VERTEX_SE2 1.75 A0 0 0 0\n", 13, "A0 again, at another time"),
@@ -124,6 +117,20 @@ def test_what_is_broken_is_refused_with_its_line(tmp_path: Path, case: str) -> N
         read_text(tmp_path, text)
     assert said in str(caught.value)
     assert caught.value.line == line
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        (PLANE + "EDGE_SE2 0 A1 A9 1 0 0 1 0 0 1 0 1\n", "A9"),
+        (PLANE.replace("VERTEX_XY L1 0 2\n", ""), "L1"),
+        (PLANE.replace("PRIOR 0 L0", "PRIOR 0 L9"), "L9"),
+    ],
+)
+def test_a_name_without_a_vertex_is_said(tmp_path: Path, text: str, name: str) -> None:
+    """It may be misspelt."""
+    assert f"1 name without a vertex line, each a variable: {name}" in read_text(tmp_path, text).notes
+    assert not any("vertex line" in note for note in read_text(tmp_path, PLANE).notes)
 
 
 LEFT_OUT = {

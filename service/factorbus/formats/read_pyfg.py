@@ -9,7 +9,7 @@ import numpy as np
 
 from factorbus.formats.assemble import EdgeColumns, VertexColumns, assembled
 from factorbus.formats.errors import FormatError, refuse_first
-from factorbus.formats.left_out import LeftOut
+from factorbus.formats.left_out import LeftOut, shown
 from factorbus.formats.lines import Bucket
 from factorbus.formats.numbers import read_numbers
 from factorbus.formats.pyfg import FACTORS, PYFG, RANGE, RANGES, RECORDS, VERTICES, Record
@@ -70,7 +70,7 @@ def read_pyfg(file: str, buckets: Mapping[str, Bucket], left: LeftOut) -> tuple[
             short = name if len(name) <= 40 else name[:37] + "..."
             left.leave(short, buckets[name].numbers, "no pyfg record that is read")
     vertices = [_vertices(file, VERTICES[name].kind, of) for name, of in found.items() if name in VERTICES]
-    _refuse_undeclared(file, found)
+    _say_undeclared(found, left)
     edges = [_edges(file, FACTORS[name].kind, of) for name, of in found.items() if name in FACTORS and name != RANGE]
     if RANGE in found:
         edges += [_edges(file, kind, part) for kind, part in _ranges(file, found[RANGE], vertices, edges, left)]
@@ -78,24 +78,15 @@ def read_pyfg(file: str, buckets: Mapping[str, Bucket], left: LeftOut) -> tuple[
     return _stamped(file, batch, found, left), lines
 
 
-def _refuse_undeclared(file: str, found: Mapping[str, _Lines]) -> None:
-    """A misspelt name would be one more variable.  A file of no vertices at all has its poses by odometry.
-
-    Raises FormatError.
-    """
+def _say_undeclared(found: Mapping[str, _Lines], left: LeftOut) -> None:
+    """A misspelt name is one more variable.  A file without any vertices has its poses by odometry."""
     declared = [of.keys for name, of in found.items() if name in VERTICES]
-    if not declared:
-        return
-    known = np.concatenate([keys.ravel() for keys in declared])
-    for name, of in found.items():
-        if name in FACTORS and name != RANGE:
-            missing = ~np.isin(of.keys, known)
-
-            def lost(row: int, name: str = name, of: _Lines = of, missing: np.ndarray = missing) -> str:
-                key = format_symbol(int(of.keys[row][missing[row]][0]))
-                return f"{name} of {key}, of which there is no vertex line"
-
-            refuse_first(file, of.lines, missing.any(axis=1), lost, "a vertex line for it, as the file has of others")
+    named = [of.keys.ravel() for name, of in found.items() if name in FACTORS and name != RANGE]
+    if declared and named:
+        known = np.concatenate([keys.ravel() for keys in declared])
+        names = [format_symbol(key) for key in np.setdiff1d(np.concatenate(named), known).tolist()]
+        if names:
+            left.say(f"{counted(len(names), 'name')} without a vertex line, each a variable: {shown(names)}")
 
 
 def _lines(file: str, name: str, record: Record, bucket: Bucket) -> _Lines:

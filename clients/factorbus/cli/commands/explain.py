@@ -17,6 +17,7 @@ _CODES = {
     "closed_here": "unavailable", "no_mirror": "unavailable", "not_finite_numbers": "not_finite",
     "not_held": "unknown_variable", "not_reached": "unavailable",
     "dataset_problem": "problem", "format_error": "bad_file",
+    "bad_recording": "bad_file",
     "map_there": "map_exists", "no_pose": "unknown_variable", "nobody_listens": "unavailable",
     "not_here": "unknown_map", "missing_variables": "unknown_variable",
     "not_in_map": "unknown_variable", "solver_error": "problem",

@@ -16,10 +16,12 @@ from factorbus.cli.logs.start import Start, course, started
 from factorbus.client.draft import Draft
 from factorbus.client.frames import compose, inverse
 from factorbus.client.imu import cut_samples
+from factorbus.client.imu_samples import GAP
 from factorbus.formats import FormatError
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
+from factorbus.wording import counted
 
 _MOST, _FAR, _TOLERANCE_NS = 1000, 20.0, 5_000_000
 _FRAME = (100.0, 100.0, 100.0, 0.02, 0.02, 3.0)
@@ -45,10 +47,11 @@ class LogSteps(Sequence[Batch]):
     @property
     def notes(self) -> tuple[str, ...]:
         """What was assumed of the start, for people."""
+        said = (self.start.why, *_gaps(self._log.imu.times))
         if not self._framed:
-            return (self.start.why,)
+            return said
         frame = "GNSS's frame f0 is found out" if self._frame is not None else "fixes are left out: it moved too little"
-        return self.start.why, frame
+        return *said, frame
 
     def __len__(self) -> int:
         return len(self._batches)
@@ -170,7 +173,18 @@ def samples_between(log: SensorLog, begin: int, end: int) -> F64:
     times = log.imu.times
     rows = slice(max(int(np.searchsorted(times, begin, "right")) - 1, 0), int(np.searchsorted(times, end)))
     seconds = (times[rows] - begin) * 1e-9
-    return cut_samples(seconds, log.imu.rates[rows, :3], log.imu.rates[rows, 3:], 0.0, (end - begin) * 1e-9)
+    rates, lasts = log.imu.rates[rows], (end - begin) * 1e-9
+    return cut_samples(seconds, rates[:, :3], rates[:, 3:], 0.0, lasts, longest_s=np.inf)  # gaps are said
+
+
+def _gaps(times: I64) -> tuple[str, ...]:
+    """Where samples were lost, which the last one before is taken to hold for."""
+    steps = np.diff(times)
+    lost = steps[steps > GAP * np.median(steps)] if steps.size else steps
+    if not lost.size:
+        return ()
+    gaps = counted(lost.size, "gap")
+    return (f"{gaps} in the IMU's samples, of up to {1e-9 * lost.max():.3g} s: the sample before is taken to hold",)
 
 
 def pose_times(log: SensorLog) -> I64:
