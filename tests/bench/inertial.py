@@ -21,8 +21,6 @@ It is held against: ours in at most a fifth of iSAM2's CPU time, an error_m no w
 1.002 of its optimum.
 """
 
-import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -30,6 +28,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from bench.drive_rows import DriveBench, print_rows
 from bench.drives_with_imu import DRIVES, Drive, drive_of
 from bench.inertial_solvers import SOLVERS
 
@@ -38,24 +37,13 @@ _FASTER, _WORSE, _CHI2 = 0.2, 1.01, 1.002
 
 def main() -> int:
     """Drive and print; the exit code is 1 when a target is missed."""
-    parser = argparse.ArgumentParser(prog="factorbus bench inertial", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", default=",".join(DRIVES), help="NAME,... of " + ", ".join(DRIVES))
-    parser.add_argument("--every", type=int, default=10, help="look at χ² at every N-th step")
-    parser.add_argument("--steps", type=int, help="how many first steps; without, all")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
-    told = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    for name in told.only.split(","):
-        drive = drive_of(name, told.steps)
-        for solver in SOLVERS:
-            rows.append(measured(drive, solver, told.every))
-            if not told.json:
-                print("  ".join(f"{key} {value}" for key, value in rows[-1].items()), flush=True)
-    if told.json:
-        print(json.dumps({"rows": rows, "missed": missed(rows)}))
-    for each in missed(rows):
-        print(f"missed: {each}", file=sys.stderr)
-    return 1 if missed(rows) else 0
+    return print_rows(DriveBench("inertial", __doc__ or "", tuple(DRIVES), "χ²", 10, driven, missed))
+
+
+def driven(name: str, steps: int | None, every: int) -> list[dict[str, Any]]:
+    """The rows of a drive."""
+    drive = drive_of(name, steps)
+    return [measured(drive, solver, every) for solver in SOLVERS]
 
 
 def measured(drive: Drive, name: str, every: int) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 goats_15 and goats_16 are .pyfg files: an underwater robot and acoustic beacons.  Plaza1 and Plaza2 (a lawn mower and
 radio beacons; Djugash, Hamner and Roth, 2009) are tables, which are written as .pyfg here.
 
-Where a beacon is nobody is told.  One range is a circle, and ranges from a straight way fit two places, one on each
+Where a beacon is is unknown.  One range is a circle, and ranges from a straight way fit two places, one on each
 side of it.  So the ranges to a new beacon wait.  Least squares over the waiting ranges begins at 36 places around the
 way; the beacon enters, with all ranges that waited, at the best minimum, once
 

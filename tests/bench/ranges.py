@@ -22,8 +22,6 @@ A row has dataset, solver, versions, steps, and
 It is held against: χ² within 1.002 of its optimum, an optimum as GTSAM's to 1e-6, and less CPU time than iSAM2.
 """
 
-import argparse
-import json
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping
@@ -33,6 +31,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from bench.drive_rows import DriveBench, print_rows
 from bench.range_drives import NAMES, Feed, feed_of, true_places, valued
 from bench.range_solvers import Isam2, Ours, gtsam_optimum
 from bench.replays.columns import F64
@@ -44,23 +43,7 @@ _CHI2, _OFF = 1.002, 1e-6
 
 def main() -> int:
     """Drive and print; the exit code is 1 when a target is missed."""
-    parser = argparse.ArgumentParser(prog="factorbus bench ranges", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", default=",".join(NAMES), help="NAME,... of " + ", ".join(NAMES))
-    parser.add_argument("--every", type=int, default=100, help="look at the χ² of iSAM2 at every N-th step")
-    parser.add_argument("--steps", type=int, help="how many first steps; without, all")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
-    told = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    for name in told.only.split(","):
-        rows += driven(name, told.steps, told.every)
-        if not told.json:
-            for row in rows[-2:]:
-                print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
-    if told.json:
-        print(json.dumps({"rows": rows, "missed": missed(rows)}))
-    for each in missed(rows):
-        print(f"missed: {each}", file=sys.stderr)
-    return 1 if missed(rows) else 0
+    return print_rows(DriveBench("ranges", __doc__ or "", NAMES, "the χ² of iSAM2", 100, driven, missed))
 
 
 def driven(name: str, steps: int | None, every: int) -> list[dict[str, Any]]:

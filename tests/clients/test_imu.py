@@ -172,7 +172,7 @@ def test_standing_still_tells_attitude_and_gyroscope_bias(seed: int) -> None:
 
 
 def test_what_standing_still_tells_is_as_certain_as_it_says() -> None:
-    """Of 300 standstills: the errors over their standard deviations have the mean square of so many numbers."""
+    """Of 300 standstills: the errors over their standard deviations have the mean square of that number of numbers."""
     rng, gyroscope, tilt = np.random.default_rng(4), list[float](), list[float]()
     for _ in range(300):
         R = Rotation.random(random_state=int(rng.integers(1 << 30)))

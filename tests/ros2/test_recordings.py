@@ -155,9 +155,24 @@ def test_of_a_recording_that_was_cut_off_the_beginning_is_driven(whole: Path, tm
             continue
         read += 1
         assert [bits(a) for a in made.steps] == [bits(b) for b in reference.steps[: len(made.steps)]]
-        assert any("no end" in note or "cut off" in note for note in made.notes)
+        assert any("no index" in note or "cut off" in note for note in made.notes)
     assert read > 30
     assert refused >= 4
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_folder_whose_recorder_was_killed_has_no_metadata_and_is_driven(
+    drive: recordings.Drive, whole: Path, tmp_path: Path, storage: StoragePlugin, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = recordings.write_rosbag2(tmp_path / "killed", drive.said, storage)
+    (path / "metadata.yaml").unlink()
+    made = read_recording(path, FOUND)
+    assert same(made, read_recording(whole, FOUND))
+    assert any("no metadata.yaml: killed" in note for note in made.notes)
+    assert run(capsys, path, "--in-process")[0] == OK
+    (path / "another.db3").write_bytes(b"")
+    with pytest.raises(BadRecording, match=r"2 files and no metadata.yaml; wanted .*`ros2 bag reindex`"):
+        read_recording(path, FOUND)
 
 
 @pytest.mark.parametrize("ending", ["mcap", "bag", "sqlite"])

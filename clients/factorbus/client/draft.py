@@ -296,7 +296,7 @@ class Draft:
         jacobians: H of each, (m, 3) of an se2 or point3, (m, 6) of an se3 or idp, (m, 2) of a point2, (m, n) of a
         vector of n; residual: b, (m,), of any m, and the certainty is of these m.
         kinds: of each, such as ["se3", "vector3"].  Without, that of the variables in this draft; of one of an earlier
-        insert it is wanted where several kinds have so many numbers: two, three or six.
+        insert it is wanted where several kinds have that number of numbers: two, three or six.
         More rows than the variables have scalars are sent as the triangle that says the same.
         """
         numbers = key_numbers(keys).tolist()

@@ -102,7 +102,7 @@ def _all_kinds(
 
 
 def _could_be(value: F64, J: F64) -> list[str]:
-    """The kinds of variables that have so many numbers, and so many in their tangent."""
+    """The kinds of variables of that size, and of that size of their tangent space."""
     columns = J.shape[1] if J.ndim == 2 else -1
     kinds = [kind for kind in VARIABLE_KINDS.values() if value.shape == (kind.size,)]
     return [kind.name for kind in kinds if columns in (kind.dim, -1)] or [kind.name for kind in kinds]

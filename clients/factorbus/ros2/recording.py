@@ -19,8 +19,11 @@ from factorbus.wording import counted
 _LATEST = DISTRIBUTIONS["jazzy"]  # of recordings that do not say what their messages are made of
 
 
+METADATA, OF_ROSBAG2 = "metadata.yaml", (".mcap", ".db3")
+
+
 class Recorded(NamedTuple):
-    """One message, as it was recorded.  read: gives it as an object, whose fields are those of the message."""
+    """One message, as it was recorded."""
 
     topic: str
     type_name: str
@@ -49,15 +52,20 @@ class _Source(Protocol):
 
 
 class RobotRecording:
-    """A recording that is open, until `close`.  `notes` tells what of it could not be read.
+    """A recording that is open, until `close`.
 
     Raises BadRecording: it is none, or nothing of it can be read.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.notes = path, list[str]()
+        self.path, self._opened, self._damaged = path, "", ""
         self._stack = ExitStack()
         self._source: _Source = self._open()
+
+    @property
+    def notes(self) -> list[str]:
+        """How it was opened where not as a whole, and where the last reading of it ended before its end."""
+        return [note for note in (self._opened, self._damaged) if note]
 
     @property
     def topics(self) -> list[RecordedTopic]:
@@ -72,9 +80,8 @@ class RobotRecording:
                 count += 1
                 yield message
         except Exception as fault:  # whatever the file and the libraries that read it make of the damage
-            note = f"cut off or damaged after {counted(count, 'message')} ({_told(fault)}): what comes before is used"
-            if note not in self.notes:
-                self.notes.append(note)
+            where = f"after {counted(count, 'message')} that are read"
+            self._damaged = f"cut off or damaged {where} ({_told(fault)}): what comes before is used"
 
     def read(self, message: Recorded) -> Any:
         """As an object.  Raises whatever the bytes lead to."""
@@ -93,26 +100,38 @@ class RobotRecording:
     def _open(self) -> _Source:
         if not self.path.exists():
             raise BadRecording(self.path, "no such file", "a rosbag2 folder, or a .mcap, .db3 or .bag file")
+        path = self._file_of_folder() if self.path.is_dir() else self.path
         try:
-            return _Whole(self.path, self._stack)
+            return _Whole(path, self._stack)
         except Exception as fault:  # whatever the file and the libraries that read it make of the damage
             first = fault
-        if self.path.suffix == ".mcap":
-            return self._begun(first)
-        advice = "reindexed by `rosbag reindex`" if self.path.suffix == ".bag" else "with its end"
+        if path.suffix == ".mcap":
+            return self._begun(path, first)
+        advice = "reindexed by `rosbag reindex`" if path.suffix == ".bag" else "with its end"
         raise BadRecording(self.path, f"it cannot be read ({_told(first)})", f"a whole recording, {advice}")
 
-    def _begun(self, first: Exception) -> _Source:
-        """An MCAP file without its end, from its beginning."""
+    def _file_of_folder(self) -> Path:
+        """The folder, or the one file in it where a recorder that was killed has not written metadata.yaml."""
+        if (self.path / METADATA).is_file():
+            return self.path
+        files = sorted(each for each in self.path.iterdir() if each.suffix in OF_ROSBAG2)
+        if len(files) != 1:
+            wanted = f"{METADATA}, which `ros2 bag reindex` writes, or one file"
+            raise BadRecording(self.path, f"{counted(len(files), 'file')} and no {METADATA}", wanted)
+        self._opened = f"no {METADATA}: {files[0].name} is read"
+        return files[0]
+
+    def _begun(self, path: Path, first: Exception) -> _Source:
+        """An MCAP file that cannot be opened as a whole, without its end for example, from its beginning."""
         from factorbus.ros2.unfinished_mcap import UnfinishedMcap
 
         try:
-            source = UnfinishedMcap(self.path)
+            source = UnfinishedMcap(path)
         except Exception as fault:
             raise BadRecording(self.path, f"it cannot be read ({_told(fault)})", "an MCAP file") from None
         if not source.topics:
             raise BadRecording(self.path, f"no topic of ROS in it ({_told(first)})", "a robot's recording")
-        self.notes.append(f"it has no end ({_told(first)}): it is read from its beginning")
+        self._opened = f"it has no index that can be read ({_told(first)}): it is read from its beginning"
         return source
 
 

@@ -36,7 +36,9 @@ class UnfinishedMcap:
         self._types = {
             number: (channel.topic, schemas[channel.schema_id].name)
             for number, channel in channels.items()
-            if channel.message_encoding == _ENCODED and schemas[channel.schema_id].encoding == _DEFINED
+            if channel.message_encoding == _ENCODED
+            and channel.schema_id in schemas
+            and schemas[channel.schema_id].encoding == _DEFINED
         }
         self.topics = [RecordedTopic(*self._types[number], counts[number]) for number in self._types]
         used = {channels[number].schema_id for number in self._types}

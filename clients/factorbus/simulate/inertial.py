@@ -1,4 +1,4 @@
-"""A robot with an IMU, GNSS and a visual odometry, of which nobody knows where the sensors are, or where the map is.
+"""A robot with an IMU, GNSS and a visual odometry; where its sensors are, and where the map is, is unknown.
 
 The map begins where the robot stands still for two seconds, z up, x where it looks.  Then it drives in curves, up and
 down, and rolls.  What is true of it is consistent with the IMU to the last digit: each sample holds until the next.

@@ -178,7 +178,7 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
     if request.live:
         require("gateway", "--live")
     request = replace(request, file=source_of(request.file))
-    graph, steps = read_steps(request)
+    graph, steps = read_steps(request.file, request.robot, request.dialect, request.strict, request.use_values)
     with _target(request) as target:
         before = target.summary()
         with screen.progress(request.file.name, steps.poses) as show:

@@ -25,16 +25,18 @@ def check_kind(file: Path) -> None:
             raise click.UsageError(f"{option} is of {is_of}")
 
 
-def read_steps(request: Any) -> tuple[Any, Any]:
-    """The graph or the recording that a `ReplayRequest` names, and its steps.  Raises FormatError, BadRecording."""
-    if not is_recording(request.file):
-        graph = read_drive(request.file, request.dialect, request.strict)
-        return graph, graph.steps(use_values=request.use_values)
+def read_steps(
+    file: Path, robot: RobotOptions | None, dialect: str | None, strict: bool, use_values: bool
+) -> tuple[Any, Any]:
+    """The graph or the recording in a file, and its steps.  Raises FormatError, BadRecording."""
+    if not is_recording(file):
+        graph = read_drive(file, dialect, strict)
+        return graph, graph.steps(use_values=use_values)
     require("ros2", "a recording")
     from factorbus.ros2.recorded_drive import read_recording
     from factorbus.ros2.settings import Settings, robot_settings
 
-    settings = robot_settings(request.robot) if request.robot else Settings(odometry="", poses=(), landmarks=())
-    drive = read_recording(request.file, settings, request.strict)
-    say(request.file, drive.notes)
+    settings = robot_settings(robot) if robot else Settings(odometry="", poses=(), landmarks=())
+    drive = read_recording(file, settings, strict)
+    say(file, drive.notes)
     return drive, drive.steps
