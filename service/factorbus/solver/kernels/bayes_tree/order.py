@@ -17,6 +17,7 @@ from factorbus.solver.kernels.model.sizes import is_pose
 from factorbus.solver.kernels.sparse.amd import ELEMENT, order_nodes, quotient_graph
 
 NEWEST = MOST_RINGS + 3  # the last group: above those of all rings, and that of what is recent
+MOST_JOINED = 10  # nodes of later groups that a variable may join by its elimination
 
 
 @part
@@ -75,7 +76,30 @@ def order_affected(
             near[put[i]], near[put[j]] = j, i
             put[i] += 1
             put[j] += 1
+    raise_hubs(n, m, near, begin, length, elements, group)
     return order_nodes(dims, quotient, near, total, group)
+
+
+@part
+def raise_hubs(n: int, m: int, near: I64, begin: I64, length: I64, elements: I64, group: I64) -> None:
+    """A variable joined to more than MOST_JOINED nodes of later groups goes into the last group among them.
+
+    Eliminated before them it would join each to all others: a beacon that a whole drive has ranges to.  After the n
+    variables come m elements; the group of an element is the last one of its members.
+    """
+    last = np.zeros(n + m, np.int64)
+    last[:n] = group
+    for e in range(n, n + m):
+        for at_member in range(begin[e], begin[e] + length[e]):
+            last[e] = max(last[e], group[near[at_member]])
+    for k in range(n):
+        joined, highest = 0, group[k]
+        for slot in range(begin[k], begin[k] + length[k]):
+            beside = last[near[slot]]
+            joined += 1 if beside > group[k] else 0
+            highest = max(highest, beside)
+        if joined > MOST_JOINED:
+            group[k] = min(highest, NEWEST - 2)
 
 
 @inline_kernel
