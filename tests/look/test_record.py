@@ -3,7 +3,7 @@
 import json
 import signal
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from factorbus.cli.driving.columns import merged
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import FAILED, OK
 from factorbus.client import connect
-from factorbus.proto.messages import Variables
+from factorbus.proto.messages import Delta, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
-from factorbus.proto.symbols import format_symbol, parse_symbol
+from factorbus.proto.symbols import parse_symbol
 from factorbus.simulate import city_trees
 
 pytest.importorskip("foxglove")
@@ -44,6 +44,11 @@ def messages(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:
                 assert decode is not None
                 found[channel.topic].append(decode(message.data))
     return found, schemas
+
+
+def rows_of(numbers: Sequence[float], count: int) -> list[list[float]]:
+    """count rows of equal length, one after another."""
+    return np.array(numbers).reshape(count, -1).tolist()
 
 
 T0 = 1_403_636_579_763_555_584
@@ -82,27 +87,27 @@ def test_a_recording_has_every_estimate_and_every_factor(
     # Replaying the deltas gives the estimate at the end, bit for bit.
     estimate, stamps, revision = {}, {}, 0
     for delta in found["/map/delta"]:
-        assert delta["previous"] in (0, revision)
-        revision = delta["revision"]
-        for group in delta["variables"]:
-            estimate |= dict(zip(group["keys"], group["values"], strict=True))
-            if "stamps" in group:
-                stamps |= dict(zip(group["keys"], group["stamps"], strict=True))
+        assert delta.previous in (0, revision)
+        revision = delta.revision
+        for group in delta.variables:
+            estimate |= dict(zip(group.keys, rows_of(group.values, len(group.keys)), strict=True))
+            stamps |= dict(zip(group.keys, group.stamps, strict=False))
+            assert group.width * len(group.keys) == len(group.values)
     wanted = {
-        format_symbol(key): value.tolist()
+        key: value.tolist()
         for keys, values in last.columns.values()
         for key, value in zip(keys.tolist(), values, strict=True)
     }
     assert (revision, estimate) == (last.revision, wanted)
-    known = {key: stamp for key, stamp in stamps.items() if stamp is not None}
-    assert known == {f"x{n}": str(T0 + n) for n in range(120) if n % 5 != 2}, "all digits, as text"
+    known = {key: stamp for key, stamp in stamps.items() if stamp != NO_STAMP}
+    assert known == {parse_symbol(f"x{n}"): T0 + n for n in range(120) if n % 5 != 2}
     # Every factor once, in order.
     for group in graph.factors:
-        mine = [each for each in found["/map/factors"] if each["kind"] == group.kind]
-        rows = [[parse_symbol(key) for key in row] for each in mine for row in each["keys"]]
-        assert rows == group.keys.tolist()
-        assert [row for each in mine for row in each["measured"]] == group.measured.tolist()
-        assert [row for each in mine for row in each["information"]] == group.information.tolist()
+        mine = [each for each in found["/map/factors"] if each.kind == group.kind]
+        assert {each.arity for each in mine} == {group.keys.shape[1]}
+        assert [key for each in mine for key in each.keys] == group.keys.ravel().tolist()
+        assert [number for each in mine for number in each.measured] == group.measured.ravel().tolist()
+        assert [number for each in mine for number in each.information] == group.information.ravel().tolist()
     assert sum(len(group.keys) for group in graph.factors) == merged(step.batch for step in steps).factor_count
     chi2 = [step["chi2"] for step in found["/map/step"] if "chi2" in step]
     assert len(chi2) >= 80, "of each insert, and of further steps"
@@ -130,6 +135,23 @@ def test_a_transform_has_the_time_of_its_pose_where_there_is_a_place_for_it(
     found, _ = messages(tmp_path / "one.mcap")
     (transform,) = found["/tf"]
     assert (transform.timestamp.seconds, transform.timestamp.nanos) == divmod(told, 10**9)
+
+
+def test_a_recording_is_small_and_smaller_without_numbers(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    poses, sizes = Variables("se2", np.arange(1000), rng.normal(size=(1000, 3))), {}
+    keys, z, information = np.arange(1000).reshape(500, 2), rng.normal(size=(500, 3)), rng.normal(size=(500, 6))
+    factors = Factors("between_se2", keys, z, information)
+    for with_deltas in (True, False):
+        path = tmp_path / f"{with_deltas}.mcap"
+        with Recording(path, with_deltas) as recording:
+            recording.take(Look(1, 1, (poses,), (Delta(1, 1, 0, (poses,)),), (factors,), 1, False), now_ns=7)
+        sizes[with_deltas] = path.stat().st_size
+        found, _ = messages(path)
+        assert ("/map/delta" in found, "/map/factors" in found) == (with_deltas, with_deltas)
+        assert "/map/step" in found
+    numbers = 8 * (poses.keys.size + 3000 + keys.size + z.size + information.size)
+    assert sizes[True] - sizes[False] < 1.1 * numbers
 
 
 def test_a_recording_never_replaces_a_file(endpoint: str, tmp_path: Path, capsys) -> None:

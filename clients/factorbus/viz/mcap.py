@@ -6,11 +6,11 @@
 | /map/scene | foxglove.SceneUpdate | trajectory, landmarks, loop closures coloured by how badly they fit |
 | /map/poses | foxglove.PosesInFrame | all poses |
 | /map/step | factorbus.Step, JSON | the report of each step, for plots: chi2, step_ms, eliminated, … |
-| /map/delta | factorbus.Delta, JSON | each delta, whole: variables by kind, keys, values and time stamps |
-| /map/factors | factorbus.Factors, JSON | factors when they were first seen, by kind: keys, measured, information |
+| /map/delta | factorbus.Delta, protobuf | each delta, whole: variables by kind, keys, values and time stamps |
+| /map/factors | factorbus.Factors, protobuf | factors when they were first seen, by kind: keys, measured, information |
 
-Messages are logged at the time at which they are written.  A time stamp is in nanoseconds, in JSON as text with all its
-digits, null of a variable without.  A pose without, or with one that MCAP has no place for, is in /tf at the log time.
+Messages are logged at the time at which they are written.  A time stamp is in nanoseconds, of a variable without one
+−2⁶³.  A pose without, or with one that MCAP has no place for, is in /tf at the log time.
 """
 
 import math
@@ -28,57 +28,34 @@ from foxglove.channels import FrameTransformChannel, PosesInFrameChannel, SceneU
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
-from factorbus.proto.symbols import format_symbol, symbol_parts
+from factorbus.proto.symbols import symbol_parts
 from factorbus.viz.map_follower import Look
+from factorbus.viz.mcap_numbers import NumberChannels
 from factorbus.viz.mcap_scene import scene_of
 
 _BEYOND_NS = 2**32 * 10**9  # MCAP's seconds are 32 bits without a sign
-_NUMBERS = {"type": "array", "items": {"type": "number"}}
-_ROWS = {"type": "array", "items": _NUMBERS}
-_KEYS = {"type": "array", "items": {"type": "string"}}
 _STEP = {
     "title": "factorbus.Step",
     "type": "object",
     "properties": {name: {"type": "number"} for name in ("epoch", "revision", "chi2", "step_ms", "changed")}
     | {name: {"type": "string"} for name in ("strategy", "because")},
 }
-_STAMPS = {"type": "array", "items": {"type": ["string", "null"]}}
-_GROUP = {
-    "type": "object",
-    "properties": {"kind": {"type": "string"}, "keys": _KEYS, "values": _ROWS, "stamps": _STAMPS},
-}
-_DELTA = {
-    "title": "factorbus.Delta",
-    "type": "object",
-    "properties": {name: {"type": "integer"} for name in ("epoch", "revision", "previous")}
-    | {"variables": {"type": "array", "items": _GROUP}},
-}
-_FACTORS = {
-    "title": "factorbus.Factors",
-    "type": "object",
-    "properties": {
-        "epoch": {"type": "integer"},
-        "revision": {"type": "integer"},
-        "kind": {"type": "string"},
-        "keys": {"type": "array", "items": _KEYS},
-        "measured": _ROWS,
-        "information": _ROWS,
-    },
-}
 
 
 class Recording:
-    """An MCAP file that is written, look by look.  Use it in `with`.  Raises FileExistsError."""
+    """An MCAP file that is written, look by look.  Use it in `with`.  Raises FileExistsError.
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    with_deltas: also the estimate after each step and the factors, as numbers
+    """
+
+    def __init__(self, path: str | os.PathLike[str], with_deltas: bool = True) -> None:
         self._context = context = foxglove.Context()  # channels do not keep it alive
         self._writer = foxglove.open_mcap(os.fspath(path), context=context)
         self._tf = FrameTransformChannel("/tf", context=context)
         self._scene = SceneUpdateChannel("/map/scene", context=context)
         self._poses = PosesInFrameChannel("/map/poses", context=context)
         self._step = foxglove.Channel("/map/step", schema=_STEP, context=context)
-        self._delta = foxglove.Channel("/map/delta", schema=_DELTA, context=context)
-        self._factors = foxglove.Channel("/map/factors", schema=_FACTORS, context=context)
+        self._numbers = NumberChannels(context) if with_deltas else None
         self._seen: dict[str, int] = {}
         self._epoch = 0
         self.deltas = self.factors = self.revision = 0
@@ -118,8 +95,8 @@ class Recording:
         at = {"epoch": delta.epoch, "revision": delta.revision}
         numbers = {k: v for k, v in delta.report.items() if isinstance(v, (int, float, str)) and _finite(v)}
         self._step.log(at | numbers, log_time=now_ns)
-        groups = [_group(group, group.values) for group in delta.variables if group.values is not None]
-        self._delta.log(at | {"previous": delta.previous, "variables": groups}, log_time=now_ns)
+        if self._numbers is not None:
+            self._numbers.write_delta(delta, now_ns)
         self.deltas += 1
 
     def _take_factors(self, look: Look, group: Factors, now_ns: int) -> None:
@@ -129,26 +106,15 @@ class Recording:
             return
         self._seen[group.kind] = len(group.keys)
         self.factors += len(group.keys) - first
-        content = {
-            "epoch": look.epoch,
-            "revision": look.factors_revision,
-            "kind": group.kind,
-            "keys": [[format_symbol(k) for k in row] for row in group.keys[first:].tolist()],
-            "measured": group.measured[first:].tolist(),
-            "information": group.information[first:].tolist(),
-        }
-        self._factors.log(content, log_time=now_ns)
+        if self._numbers is not None:
+            new = group._replace(
+                keys=group.keys[first:], measured=group.measured[first:], information=group.information[first:]
+            )
+            self._numbers.write_factors(look.epoch, look.factors_revision, new, now_ns)
 
 
 def _finite(value: Any) -> bool:
     return isinstance(value, str) or math.isfinite(value)
-
-
-def _group(group: Variables, values: F64) -> dict[str, Any]:
-    content = {"kind": group.kind, "keys": [format_symbol(k) for k in group.keys.tolist()], "values": values.tolist()}
-    if group.stamps is None:
-        return content
-    return content | {"stamps": [None if stamp == NO_STAMP else str(stamp) for stamp in group.stamps.tolist()]}
 
 
 def _last_poses(variables: Sequence[Variables]) -> list[tuple[int, F64, int]]:

@@ -29,10 +29,20 @@ if TYPE_CHECKING:
     metavar="S",
     help="Seconds between pictures of the whole map.",
 )
+@click.option(
+    "--no-deltas", is_flag=True, help="Only what is drawn and plotted, not every estimate and factor as numbers."
+)
 @click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
 def command(
-    map_name: str, endpoint: str, zenoh: str, out: Path | None, every_s: float, until: int | None, until_eof: bool
+    map_name: str,
+    endpoint: str,
+    zenoh: str,
+    out: Path | None,
+    every_s: float,
+    no_deltas: bool,
+    until: int | None,
+    until_eof: bool,
 ) -> None:
     """Record MAP into an MCAP file until Ctrl-C: every step, every estimate, every factor, and a scene to look at.
 
@@ -60,15 +70,15 @@ def command(
         if joined is None:
             print_note(f"stopped before there was a map {map_name}; nothing is recorded")
             return
-        _record(joined, path, every_s, until, stop)
+        _record(joined, path, every_s, until, stop, with_deltas=not no_deltas)
 
 
-def _record(joined: "Map", path: Path, every_s: float, until: int | None, stop: "Event") -> None:
+def _record(joined: "Map", path: Path, every_s: float, until: int | None, stop: "Event", with_deltas: bool) -> None:
     from factorbus.cli.output.console import print_note
     from factorbus.viz.map_follower import MapFollower
     from factorbus.viz.mcap import Recording
 
-    with MapFollower(joined) as follower, Recording(path) as recording:
+    with MapFollower(joined) as follower, Recording(path, with_deltas) as recording:
         recording.begin(follower.last_look(joined.timeout_s))
         click.echo(f"ready {path}")
         while not stop.wait(every_s) and (until is None or joined.estimate.revision < until):
