@@ -139,6 +139,8 @@ class Shell:
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._control, self.health_report.memory)
         self.health_report.chapters["protocol"] = known
         self.health_report.chapters["unopened"] = self.maps.unopened
+        if library is not None:
+            self.health_report.chapters["disk"] = library.disk
         self._worker_rows: list[dict[str, Any]] = []
         self.health_report.chapters["workers"] = lambda: self._worker_rows
         self._stuck: set[str] = set()

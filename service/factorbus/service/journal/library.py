@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import secrets
 import shutil
 import time
@@ -77,6 +78,11 @@ class Library:
     def names(self, known: Container[str] = ()) -> list[str]:
         """The maps that there are, without those of the names `known`."""
         return maps_in(self._owned.folder, NAME, known)
+
+    def disk(self) -> dict[str, int]:
+        """Bytes of the disk that the folder is on: how many are free for this process, and how many there are."""
+        seen = os.statvfs(self._owned.folder)
+        return {"free_bytes": seen.f_bavail * seen.f_frsize, "size_bytes": seen.f_blocks * seen.f_frsize}
 
     def has(self, name: str) -> bool:
         """Whether there is a map of this name."""

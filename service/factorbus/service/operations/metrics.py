@@ -94,7 +94,7 @@ def families(health: Mapping[str, Any]) -> Iterator[Family]:
     yield from _of_workers(health.get("workers", ()))
     yield from _of_maps(health["maps"])
     yield _one("maps_unopened", "gauge", "Maps on disk that do not open", len(health.get("unopened", ())))
-    yield from _extra("journal", "", {"": health.get("journal", {})})
+    yield from _extra("disk", "", {"": health.get("disk", {})})
 
 
 def _of_workers(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
