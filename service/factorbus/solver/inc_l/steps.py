@@ -42,8 +42,7 @@ class _Done:
     """Where the last step left things: what a failed step goes back to.
 
     unsolved: χ² of the factors added since the system was last solved; infinite if that had not converged.
-    converged: as the step reported.  Between forced batches the system may be solved, which is linear, and χ² not at its
-    optimum.
+    converged: as the step reported.  Between forced batches the linear system may be solved, and χ² not at its optimum.
     finished: nothing has moved since another step would have taken no more than a share `FINISHED` off χ².
     batch: variables when the whole system was last solved anew, which the modes with forced batches count from.
     """

@@ -176,8 +176,8 @@ def minimize(
 def try_linear_step(problem: LinearizedLeastSquares, chi2: float, rule: StoppingRule) -> Minimization | None:
     """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R.
 
-    Where the linear problem has nothing to gain nothing moves (`iterations` 0), and whether the true one would gain by a
-    step stays as it was: `converged` is then False, and means nothing.
+    Where the linear problem has nothing to gain nothing moves (`iterations` 0), and whether the true one would gain by
+    a step stays as it was: `converged` is then False, and means nothing.
     """
     result = Minimization(chi2, 0.0, factorizations=1, linear=True)
     if problem.factorize(0.0) >= 0:
