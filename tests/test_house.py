@@ -36,6 +36,13 @@ def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.arg
     return every[1:] if every and every[0].arg in ("self", "cls") else every
 
 
+def test_every_package_says_that_it_has_types() -> None:
+    """A type checker looks at the annotations of an installed package only where there is a `py.typed`."""
+    packages = [path for root in SOURCES for path in (ROOT / root / "factorbus").iterdir() if any(path.glob("*.py"))]
+    assert len(packages) > 10
+    assert not [called(path) for path in packages if not (path / "py.typed").is_file()]
+
+
 def test_no_function_has_more_than_eight_parameters() -> None:
     found = {
         (called(path), function.name)

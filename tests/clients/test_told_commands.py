@@ -98,3 +98,24 @@ def test_there_are_many_and_a_wrong_one_is_seen() -> None:
     for wrong in ("replay --evry 100 a.g2o", "frobnicate", "ask covarianze hall", "plot map a.g2o --ellipses -1"):
         with pytest.raises(click.UsageError):
             parse(shlex.split(wrong))
+
+
+def test_every_command_that_connects_takes_a_zenoh_configuration() -> None:
+    """Where a service asks for a certificate a command without one is of no use."""
+    without, many = [], 0
+
+    def look(command: click.Command, name: str) -> None:
+        nonlocal many
+        if isinstance(command, click.Group):
+            for inner in command.list_commands(click.Context(command)):
+                if (sub := command.get_command(click.Context(command), inner)) is not None:
+                    look(sub, f"{name} {inner}")
+            return
+        taken = {option for parameter in command.params for option in parameter.opts}
+        many += "--connect" in taken
+        if "--connect" in taken and "--zenoh" not in taken:
+            without.append(name)
+
+    look(cli, "factorbus")
+    assert not without
+    assert many > 20

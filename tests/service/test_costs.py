@@ -227,6 +227,26 @@ def test_association_is_bounded_in_pairs_and_in_memory(memory: MemoryLimit) -> N
     assert refused(made, "associate", ask(1), Room(memory)).code == "out_of_memory"
 
 
+@pytest.mark.parametrize(
+    ("question", "encode"),
+    [
+        ("gate", lambda factors: asking_codec.encode_ask_gate(AskGate(factors))),
+        ("gain", lambda factors: asking_codec.encode_ask_gain(AskGain(factors))),
+    ],
+)
+def test_candidates_are_bounded(question: str, encode: Callable[[tuple[Factors, ...]], bytes]) -> None:
+    """100,000 in all groups."""
+    made = many(Solver, 1)
+
+    def candidates(count: int) -> tuple[Factors, ...]:
+        rows = np.tile([0, 1], (count, 1)), np.zeros((count, 2)), np.tile([1.0, 0, 1.0], (count, 1))
+        return (Factors("landmark_se2", *rows),)
+
+    problem = refused(made, question, encode((*candidates(100_000), *candidates(1))), Room())
+    assert (problem.code, problem.detail) == ("too_large", {"size": 100_001, "limit": 100_000})
+    assert take(made, question, encode(candidates(3)), Room())[0]
+
+
 def test_a_variable_with_very_many_factors_is_not_told_of_one_by_one() -> None:
     made = many(Solver, 10_001)
     problem = refused(made, "why", asking_codec.encode_ask_why(AskWhy(key=0)), Room())

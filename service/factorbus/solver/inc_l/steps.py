@@ -42,6 +42,7 @@ class _Done:
     """Where the last step left things: what a failed step goes back to.
 
     unsolved: χ² of the factors added since the system was last solved; infinite if that had not converged.
+    converged: as the step reported.  Between forced batches the linear system may be solved, and χ² not at its optimum.
     finished: nothing has moved since another step would have taken no more than a share `FINISHED` off χ².
     batch: variables when the whole system was last solved anew, which the modes with forced batches count from.
     """
@@ -53,6 +54,7 @@ class _Done:
     damping: float = 0.0
     batch: int = 0
     finished: bool = True
+    converged: bool = True
 
 
 # The types of values in the state of these steps.
@@ -213,6 +215,8 @@ class IncrementalSteps:
         result = None
         if self._mode.batch_every and not batch:
             result = try_linear_step(system, chi2, rule)
+            if result is not None and result.iterations == 0:
+                result.converged = self._done.converged
         if result is None:
             if self._mode.batch_every:
                 system.relinearize()
@@ -248,7 +252,8 @@ class IncrementalSteps:
     def _extend(self, added: float) -> tuple[Minimization, bool]:
         """Nothing moves: what is new has the values it was given or composed to."""
         self._changed = np.arange(self._done.graph[at.VARIABLES], int(self._graph.counts[at.VARIABLES]))
-        return Minimization(self._done.chi2 + added, damping=0.0, converged=True), self._done.finished
+        result = Minimization(self._done.chi2 + added, damping=0.0, converged=self._done.converged)
+        return result, self._done.finished
 
     def _take_back(self) -> None:
         self._graph.forget(self._done.graph)
@@ -257,7 +262,7 @@ class IncrementalSteps:
     def _commit(self, result: Minimization, added: float, solved: bool, batch: bool, finished: bool) -> None:
         unsolved = self._done.unsolved + added
         if solved:
-            unsolved = 0.0 if result.converged else np.inf
+            unsolved = 0.0 if result.converged or result.linear else np.inf
         blocks, numbers = self._system.blocks.fill.tolist()
         self._done = _Done(
             self._graph.mark(),
@@ -267,6 +272,7 @@ class IncrementalSteps:
             0.0 if result.converged else result.damping,
             int(self._graph.counts[at.VARIABLES]) if batch else self._done.batch,
             finished,
+            result.converged,
         )
 
     def _reported(self, plan: Plan, because: str, batch: bool) -> Plan:

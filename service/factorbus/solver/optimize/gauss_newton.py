@@ -54,8 +54,9 @@ class LeastSquares(Protocol):
 class LinearizedLeastSquares(LeastSquares, Protocol):
     """A problem that can stay linearized where it was."""
 
-    def accept_linear(self) -> None:
-        """Move to the point linearized last, but keep the linear model: its gradient is zero there."""
+    def accept_linear(self) -> float:
+        """Move to the point linearized last, but keep the linear model, whose gradient is zero there.  Return what the
+        true gradient there, with the old factor, says that another step would take off χ²."""
         ...
 
 
@@ -86,7 +87,8 @@ class Minimization:
     """How a minimization went.
 
     failed: the block column whose pivot failed in the last factorization, or −1.  left: what the next undamped step
-    would take off χ², as predicted last; infinite where that is not known.
+    would take off χ², as predicted last; infinite where that is not known.  linear: it was one step of the linear
+    problem, which is solved, whether or not χ² has converged.
     """
 
     chi2: float
@@ -96,6 +98,7 @@ class Minimization:
     converged: bool = False
     failed: int = -1
     left: float = math.inf
+    linear: bool = False
 
 
 def minimize(
@@ -171,8 +174,12 @@ def minimize(
 
 
 def try_linear_step(problem: LinearizedLeastSquares, chi2: float, rule: StoppingRule) -> Minimization | None:
-    """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R."""
-    result = Minimization(chi2, 0.0, factorizations=1, converged=True)
+    """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R.
+
+    Where the linear problem has nothing to gain nothing moves (`iterations` 0), and whether the true one would gain by
+    a step stays as it was: `converged` is then False, and means nothing.
+    """
+    result = Minimization(chi2, 0.0, factorizations=1, linear=True)
     if problem.factorize(0.0) >= 0:
         return None
     if rule.is_negligible(problem.decrease(), chi2):
@@ -180,8 +187,9 @@ def try_linear_step(problem: LinearizedLeastSquares, chi2: float, rule: Stopping
     reached = problem.linearize_at(problem.step())
     if not reached <= chi2:
         return None
-    problem.accept_linear()
+    result.left = problem.accept_linear()
     result.chi2, result.iterations = reached, 1
+    result.converged = rule.is_negligible(result.left, reached)
     return result
 
 

@@ -97,12 +97,19 @@ class System(Generic[R]):
         self.graph.values[: self._kept.size] = self._kept
         self.anew()
 
-    def accept_linear(self) -> None:
-        """Move to the point linearized last; Λ, R and the linear model stay, whose gradient is zero there."""
+    def accept_linear(self) -> float:
+        """Move to the point linearized last; Λ, R and the linear model stay, whose gradient is zero there.
+
+        Return what the true gradient there, with R, says that another step would take off χ².
+        """
         self.graph.values, self._trial = self._trial, self.graph.values
+        self.blocks.swap_eta()
+        self.factor.turned()
+        left = self.decrease()
         self.blocks.eta[: self.graph.counts[at.SCALARS]] = 0.0
         self.factor.rest()
         self._have_lambda, self._spare_is_here, self._moved, self.drifted = False, False, True, True
+        return left
 
     def relinearize(self) -> None:
         """Λ and η at the present point, if they are not."""
