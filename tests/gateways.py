@@ -63,3 +63,11 @@ def square(false_closure: bool = False, letter: str = "x") -> Draft:
     if false_closure:
         draft.between_se2(f"{letter}2", f"{letter}10", (0, 0, 0), **sure)  # type: ignore[arg-type]
     return draft
+
+
+def arc(poses: int = 12) -> Draft:
+    """A robot that drives in a bow and comes nowhere twice: a click means one pose."""
+    draft = Draft().se2("x0", (0, 0, 0), fixed=True)
+    for i in range(poses - 1):
+        draft.se2(f"x{i + 1}").between_se2(f"x{i}", f"x{i + 1}", (1.0, 0, 0.3), sigmas=(0.05, 0.05, 0.02))
+    return draft

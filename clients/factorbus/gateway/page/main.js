@@ -28,6 +28,7 @@ window.factorbus = {
 
 function pixelIn(map, seen, key) {
   const place = map && map.placeOf(key);
+  if (place) seen.fit(map); // as it will be drawn next
   return place && seen.pixelOf(place);
 }
 

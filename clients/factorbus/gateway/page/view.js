@@ -21,6 +21,11 @@ export class View {
 
   pixelOf(place) { return this.seen.pixelOf(place); }
 
+  // All of it is in view, unless a hand has moved it.
+  fit(map) {
+    if (this.follow || !this.seen.scale) this.seen.fit([...map.variables.keys()].map((key) => map.placeOf(key)).filter(Boolean));
+  }
+
   // A variable or a factor, whichever is meant by a click there: { key }, { factor }, or null.
   at(map, edges, x, y) {
     const [key, apart] = this.nearest(map, x, y);
@@ -61,7 +66,7 @@ export class View {
   }
 
   draw(map, { closures, ellipses }, { selection = null, ghost = null, marks = [] } = {}) {
-    if (this.follow || !this.seen.scale) this.seen.fit([...map.variables.keys()].map((key) => map.placeOf(key)).filter(Boolean));
+    this.fit(map);
     const ratio = window.devicePixelRatio || 1;
     const { clientWidth: w, clientHeight: h } = this.canvas;
     this.canvas.width = w * ratio;
