@@ -11,6 +11,7 @@ import pytest
 from gateways import Editor, problem_of, square
 from processes import Process, processes
 from secured import Secured
+from walk import blocks
 
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import USAGE
@@ -201,6 +202,12 @@ def test_people_are_told_apart_by_their_tokens() -> None:
     for wrong in ("", ANN, f"Basic {ANN}", "Bearer", f"Bearer {ANN[:-1]}", "Bearer \u00e9\udcff"):
         with pytest.raises(NotAllowed):
             people.of(wrong)
+
+
+def test_the_list_in_the_guide_is_one() -> None:
+    (text,) = [text for language, text in blocks("clients/README.md") if language == "toml"]
+    people = read_people(text, "clients/README.md", NOBODY)
+    assert [(person.name, person.role) for person in people.listed] == [("ann", "operator"), ("wall", "viewer")]
 
 
 def test_pairs_say_how_a_map_lies_in_another() -> None:

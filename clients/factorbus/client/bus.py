@@ -125,7 +125,7 @@ class Bus:
         self._features.append(made)
         return made
 
-    def may_insert(self, name: str, timeout_s: float = 2.0) -> bool:
+    def may_insert(self, name: str, timeout_s: float = 5.0) -> bool:
         """Whether access control lets this client insert into map `name`; False if the bus drops it for `timeout_s`.
 
         Nothing is inserted for it.  Raises Refused, Unavailable, BadName, UnknownMap.

@@ -18,6 +18,7 @@ from factorbus.proto.messages import Accepted, MapGraph
 from factorbus.proto.problems import WrongEpoch
 from factorbus.proto.symbols import format_symbol
 
+_EDIT_S = 60.0  # for the answer to an edit, of a large map that has to converge anew
 _PAIRS = 20  # anchors of a merge whose misfit is asked for
 _DENIED = (
     "access control on the bus lets this gateway follow the map and not change it; start it with --zenoh and --client "
@@ -99,7 +100,7 @@ class Editing:
         with bus.map(name, mirror=False, create=False, client=f"{bus.client}-{person.name}") as own:
             if own.epoch != log.epoch:
                 raise WrongEpoch(log.epoch, own.epoch)
-            return own.insert(step.batch(), changes=step.changes(log.called), settle=True)
+            return own.insert(step.batch(), changes=step.changes(log.called), settle=True, timeout_s=_EDIT_S)
 
     def _log(self, name: str, epoch: int) -> EditLog:
         log = self._logs.get(name)

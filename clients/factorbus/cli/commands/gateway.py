@@ -41,7 +41,7 @@ class GatewayRequest:
 )
 @click.option(
     "--people",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=click.Path(path_type=Path),
     metavar="FILE",
     help="Who may edit: names and tokens by role, a TOML file. Without it all may who reach 127.0.0.1.",
 )

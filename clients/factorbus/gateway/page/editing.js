@@ -4,6 +4,7 @@ import { Refusal, ask, mapPath, send, sign, signedIn } from "./api.js";
 import { app, button, element, of } from "./app.js";
 
 const SHOWN = 12; // edits of the list
+const SILENT = ["unavailable", "internal"]; // nobody has said that it was refused
 
 export function notice(text, code = "") {
   of("notice").textContent = code ? `${text} [${code}]` : text;
@@ -46,7 +47,8 @@ export async function edit(content) {
     of("panel").replaceChildren(element("h2", made.undone ? "Undone" : "Done"), element("p", `${made.what}, by ${made.who}, at revision ${made.at_revision}.`), element("p", `χ² was ${short(made.chi2_before)}, and is ${short(made.chi2)}.`));
     return made;
   } catch (error) {
-    notice(error instanceof Refusal ? `Nothing was changed: ${error.message}` : `It is not known whether it was done: ${error.message}`, error.code ?? "unavailable");
+    const known = error instanceof Refusal && !SILENT.includes(error.code);
+    notice(`${known ? "Nothing was changed" : "It is not known whether it was done, look at the map"}: ${error.message}`, error.code ?? "unavailable");
     if (error.code === "not_allowed") loadSession();
     return null;
   } finally {

@@ -106,6 +106,7 @@ function show(name) {
   app.asked = NOTHING;
   app.mode = app.ghost = null;
   app.selection.clear();
+  of("panel").replaceChildren(...(app.map ? [] : of("panel").childNodes)); // the hint at first, nothing of another map
   view.follow = true;
   location.hash = name;
   app.map = new LiveMap(name, changed);
