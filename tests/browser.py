@@ -18,14 +18,17 @@ _OPTIONS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enab
 
 
 @contextmanager
-def page_of(url: str, width: int = 1200, height: int = 800) -> Iterator[Any]:
-    """The page at `url`, in a browser of its own."""
+def page_of(url: str, width: int = 1200, height: int = 800, *, evaluates: bool = True) -> Iterator[Any]:
+    """The page at `url`, in a browser of its own.
+
+    evaluates: the test has the page evaluate text, which its own policy may forbid; False: the policy stands.
+    """
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=_OPTIONS)
         try:
-            page = browser.new_page(viewport={"width": width, "height": height})
+            page = browser.new_page(viewport={"width": width, "height": height}, bypass_csp=evaluates)
             page.goto(url)
             yield page
         finally:

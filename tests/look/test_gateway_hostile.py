@@ -25,7 +25,8 @@ UPGRADE = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 1
 KEY = "dGhlIHNhbXBsZSBub25jZQ=="
 PIECES = (
     "api", "maps", "fuzzed", "nowhere", "estimate", "graph", "stats", "closures", "ellipses", "variables", "export",
-    "live", "page", "main.js", "x0", "x1", "l1", "7", "x" + "9" * 17, "x" + "9" * 5000, "9" * 4301, "x-1", "é1", "..",
+    "live", "edits", "session", "edges", "factors",
+    "page", "main.js", "x0", "x1", "l1", "7", "x" + "9" * 17, "x" + "9" * 5000, "9" * 4301, "x-1", "é1", "..",
     ".", "", "%00", "%2e%2e", "%2F", "%ff%fe", "%", "%zz", "a" * 64, "a" * 65, "a" * 300, "fuzzed%20", "*", "**", "$*",
     "fuzzed?x", "%F0%9F%98%80", "\u00e9", "~", "index.html", "CON", "x0%0d%0aSet-Cookie:a",
 )  # fmt: skip

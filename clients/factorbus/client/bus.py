@@ -10,6 +10,7 @@ from factorbus.client.arguments import checked_flag, checked_seconds, of_type
 from factorbus.client.features import Features
 from factorbus.client.link import Link, open_link
 from factorbus.client.map import SUFFIX_LENGTH, Map, MapRow
+from factorbus.client.permission import inserts_pass
 from factorbus.client.query_all import query_all
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, fields, keys
@@ -63,20 +64,31 @@ class Bus:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def map(self, name: str, mode: str = "auto", *, window: int = 32, mirror: bool = True, create: bool = True) -> Map:
+    def map(
+        self,
+        name: str,
+        mode: str = "auto",
+        *,
+        window: int = 32,
+        mirror: bool = True,
+        create: bool = True,
+        client: str = "",
+    ) -> Map:
         """Join map `name`, creating it if there is none (with create=False: UnknownMap).
 
         window: inserts that may be unanswered at a time.  mirror: keep a live copy of the estimate; returns once
-        it is there.  Raises Refused, Unavailable, BadName, UnknownMap.
+        it is there.  client: who inserts into this map, where one connection is used for several; empty: that of
+        `connect`.  Raises Refused, Unavailable, BadName, UnknownMap.
         """
         keys.checked_name("map", name)
+        client = keys.checked_name("client", client or self.client, keys.LONGEST_NAME - SUFFIX_LENGTH)
         mirror, create = checked_flag("mirror", mirror), checked_flag("create", create)
         if of_type("window", window, Integral, "a whole number, 1 or more") < 1:
             raise BadOption("window", str(window), "a whole number, 1 or more")
         joined = Map(
             self._link,
             self._sender,
-            self.client,
+            client,
             self.timeout_s,
             window,
             lambda: self.create(name, mode) if create else self._existing(name),
@@ -112,6 +124,15 @@ class Bus:
         )
         self._features.append(made)
         return made
+
+    def may_insert(self, name: str, timeout_s: float = 5.0) -> bool:
+        """Whether access control lets this client insert into map `name`; False if the bus drops it for `timeout_s`.
+
+        Nothing is inserted for it.  Raises Refused, Unavailable, BadName, UnknownMap.
+        """
+        row = self._existing(keys.checked_name("map", name))
+        client = f"{self.client}-{secrets.token_hex(4)}"
+        return inserts_pass(self._sender, name, client, row.epoch, checked_seconds("timeout_s", timeout_s, timeout_s))
 
     def maps(self, timeout_s: float | None = None) -> list[MapRow]:
         """The maps there are: of the service, or at a router of all services.  Raises Refused, Unavailable."""

@@ -1,6 +1,6 @@
 """Maps for browsers, which cannot speak Zenoh: a page that shows a map live, HTTP for questions, WebSockets for steps.
 
-It only reads.  Needs the extra `gateway` (Starlette, uvicorn, websockets).
+Who may edits maps there, by `Changes` as any client.  Needs the extra `gateway` (Starlette, uvicorn, websockets).
 """
 
 from factorbus.gateway.app import make_app

@@ -7,6 +7,8 @@
 | /api/maps/NAME/estimate, /graph, /stats, /closures, /ellipses | JSON |
 | /api/maps/NAME/variables/KEY | what holds x12 where it is |
 | /api/maps/NAME/optimum | χ² beside the optimum from scratch, whether that converged, a notice where it is better |
+| /api/maps/NAME/edges, /factors/17 | which factor is between which variables; what one measures, and how it fits |
+| /api/maps/NAME/session, /edits | who asks and whether they may edit; what was edited, and with POST an edit |
 | /api/maps/NAME/export?format=g2o | text, also `pyfg`, `jrl`, `tum` and `kitti`, of several robots with `&robot=a` |
 | /api/maps/NAME/live | WebSocket: the estimate, then what each step changed |
 """
@@ -18,7 +20,6 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -34,9 +35,12 @@ from factorbus.client import Bus, Problem
 from factorbus.client.questions import logged
 from factorbus.gateway.documents import Document, estimate, groups
 from factorbus.gateway.documents import problem as document_of
+from factorbus.gateway.edit_routes import editing_routes
 from factorbus.gateway.explain import explain
+from factorbus.gateway.guard import Guard, is_ours
 from factorbus.gateway.live import follow_map
 from factorbus.gateway.maps import JoinedMaps
+from factorbus.gateway.people import VIEWER, People, Person
 from factorbus.proto.asking import AskWhy
 from factorbus.proto.problems import UnknownQuestion
 from factorbus.proto.symbols import format_symbol, parse_symbol
@@ -45,18 +49,30 @@ from factorbus.viz.closures import closures_of
 _PAGE = Path(__file__).parent / "page"
 _STATUS = {
     "unknown_map": 404, "unknown_variable": 404, "unknown_question": 400,
-    "bad_name": 400, "bad_symbol": 400, "bad_option": 400,
+    "bad_name": 400, "bad_symbol": 400, "bad_option": 400, "bad_message": 400, "bad_shape": 400, "not_finite": 400,
+    "bad_information": 400, "not_allowed": 403, "unknown_factor": 404,
     "unavailable": 503, "shutting_down": 503, "other_protocol": 502,
 }  # fmt: skip
+# What a browser is to do with the page: run no script but ours, ask nobody but us, and show it in no page of others,
+# where clicks meant for that would edit a map.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src data:; frame-ancestors 'none'; base-uri 'none'",
+    "X-Frame-Options": "DENY",
+    "Cache-Control": "no-cache",
+}
 _OPTIMUM_S = 60.0
 # Codes of a WebSocket that is closed, from the range that is the application's.
 _FOREIGN, _PROBLEM = 4403, 4404
 _MOST_REASON = 120  # bytes of it, of 123 that a WebSocket has room for
 
 
-def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Starlette:
-    """The application, over a connection that stays the caller's.  hosts: names by which it may be called."""
+def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost"), people: People | None = None) -> Starlette:
+    """The application, over a connection that stays the caller's.  hosts: names by which it may be called.
+
+    people: who may edit; None: nobody.
+    """
     maps = JoinedMaps(bus)
+    guard = Guard(people or People(Person("local", VIEWER, "this gateway is for looking only")))
     one = "/api/maps/{name}"
     answers: dict[str, Callable[[JoinedMaps, Request], Awaitable[Response]]] = {
         "/api/maps": _list,
@@ -71,8 +87,9 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
     }
     app = Starlette(
         routes=[
-            Route("/", lambda _: FileResponse(_PAGE / "index.html")),
+            Route("/", lambda _: FileResponse(_PAGE / "index.html", headers=_HEADERS)),
             *(Route(path, partial(answer, maps)) for path, answer in answers.items()),
+            *editing_routes(one, maps, guard),
             WebSocketRoute(f"{one}/live", partial(_live, maps)),
             Mount("/page", StaticFiles(directory=_PAGE)),
         ],
@@ -162,7 +179,7 @@ async def _live(maps: JoinedMaps, socket: WebSocket) -> None:
     """Only for pages of ours: a browser says where its page is from."""
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # the latter: it was closed before for what it sent
         await socket.accept()
-        if not _is_ours(socket.headers.get("origin"), socket.headers.get("host")):
+        if not is_ours(socket.headers.get("origin"), socket.headers.get("host")):
             await socket.close(_FOREIGN, "this page is not from here")
             return
         try:
@@ -171,14 +188,6 @@ async def _live(maps: JoinedMaps, socket: WebSocket) -> None:
         except Problem as problem:
             reason = problem.message.encode()[:_MOST_REASON].decode(errors="ignore")
             await socket.close(_PROBLEM, reason)
-
-
-def _is_ours(origin: str | None, host: str | None) -> bool:
-    """Whether a page from `origin`, if it is one, was fetched from here."""
-    try:
-        return origin is None or urlsplit(origin).netloc == host
-    except ValueError:  # it is no address at all
-        return False
 
 
 async def _problem(_: Request, problem: Exception) -> Response:
@@ -193,6 +202,6 @@ async def _no_answer(request: Request, fault: Exception) -> Response:
     status, headers = http.status_code, http.headers
     if not request.url.path.startswith("/api/"):
         return PlainTextResponse(http.detail, status, headers)
-    wanted = "an address below /api/maps, as clients/README.md lists them, and GET"
+    wanted = "an address below /api/maps, as clients/README.md lists them, with GET, and POST for edits"
     problem = UnknownQuestion(f"{request.method} {request.url.path}", wanted)
     return Document(document_of(problem.code, problem.message, problem.detail), status_code=status, headers=headers)

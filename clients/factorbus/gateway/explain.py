@@ -4,7 +4,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from factorbus.proto.asking import Why
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import MapGraph
 from factorbus.proto.symbols import format_symbol
 from factorbus.proto.why_text import fall_without
 from factorbus.wording import counted
@@ -46,6 +50,33 @@ def explain(why: Why) -> dict[str, Any]:
         "step": f"{why.step['strategy']}: {why.step['because']}" if why.step else "",
         "text": _text(name, explained, rows, why.step),
     }
+
+
+def explain_factor(why: Why, graph: MapGraph) -> dict[str, Any]:
+    """One factor: what `explain` has of it, and residual, weighted = Lᵀ r with Ω = L Lᵀ, inactive, text; measured and
+    sigmas, √ of the diagonal of Ω⁻¹ (metres, radians), where `graph` has the factor and Ω an inverse, else null."""
+    measured, sigmas = _measured(why.factor["factor"], graph)
+    reported = {name: why.factor[name] for name in ("residual", "weighted", "inactive")}
+    at_hand = {"measured": measured, "sigmas": sigmas, "revision": why.revision, "text": why.text}
+    return _row(why.factor) | reported | at_hand
+
+
+def _measured(factor: int, graph: MapGraph) -> tuple[list[float] | None, list[float] | None]:
+    for group in graph.batch.factors:
+        at = np.flatnonzero(group.ids == factor)
+        if at.size:
+            row = group.information[at[0]]
+            dim = int((np.sqrt(8 * row.size + 1) - 1) / 2)
+            omega = np.zeros((dim, dim))
+            omega[np.triu_indices(dim)] = row
+            omega += np.triu(omega, 1).T
+            sigmas = None
+            if np.linalg.matrix_rank(omega, hermitian=True) == dim:
+                found = np.sqrt(np.diag(np.linalg.inv(omega)))
+                found[FACTOR_KINDS[group.kind].half_angle_rows] *= 2.0
+                sigmas = found.tolist()
+            return group.measured[at[0]].tolist(), sigmas
+    return None, None
 
 
 def _row(factor: Mapping[str, Any]) -> dict[str, Any]:

@@ -285,7 +285,7 @@ def _target(request: ReplayRequest) -> Iterator[Any]:
                 map=request.map_name,
             )
         if request.live:
-            page = stack.enter_context(gateway(endpoint, request.port, request.zenoh))
+            page = stack.enter_context(gateway(endpoint, request.port, request.zenoh, request.client))
             print_note(f"the map, live: {page}/#{request.map_name}")
         target = RemoteMap(joined, request.window)
         stack.callback(target.close)

@@ -37,8 +37,8 @@ EXTRAS = {
 }
 
 _USAGE_CODES = (
-    "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_picture", "bad_ros_name", "bad_setting",
-    "cannot_listen", "exposed", "port_taken",
+    "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_people", "bad_picture", "bad_ros_name",
+    "bad_setting", "cannot_listen", "exposed", "port_taken",
 )  # fmt: skip
 # Of what was typed, where the command itself finds it; a service says the same of what is in a file.
 _TYPED_CODES = ("bad_information", "bad_loss", "bad_shape", "not_finite")

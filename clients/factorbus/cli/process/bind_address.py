@@ -19,7 +19,7 @@ def insecure_option(command: F) -> F:
 
 def refuse_open_page(host: str, insecure: bool) -> None:
     """Raises Stopped where other machines could reach `host`, and nobody said that they may."""
-    if not insecure and not _is_loopback(host):
+    if not insecure and not is_loopback(host):
         raise Stopped(
             "exposed",
             f"{host} can be reached from other machines, and a page for browsers asks nobody who they are; serve it at "
@@ -29,8 +29,8 @@ def refuse_open_page(host: str, insecure: bool) -> None:
         )
 
 
-def _is_loopback(host: str) -> bool:
-    """A name other than localhost may stand for anything."""
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches `host`.  A name other than localhost may stand for anything."""
     try:
         return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

@@ -165,9 +165,11 @@ def service(
 
 
 @contextmanager
-def gateway(endpoint: str, port: int, zenoh: str = "", timeout_s: float = 60.0) -> Iterator[str]:
+def gateway(
+    endpoint: str, port: int, zenoh: str = "", client: str = "gateway", timeout_s: float = 60.0
+) -> Iterator[str]:
     """A process that shows the maps at `endpoint` to browsers, and the address of its page."""
-    known = ("--zenoh", zenoh) if zenoh else ()
+    known = ("--zenoh", zenoh, "--client", client) if zenoh else ()
     with child("gateway", "gateway", "--connect", endpoint, "--port", str(port), "--until-eof", *known) as process:
         yield process.ready(timeout_s)[0]
 

@@ -8,6 +8,7 @@ export class LiveMap {
     this.changed = changed;
     this.variables = new Map(); // "x12" → { kind, value }
     this.touched = new Set();
+    this.touchedAt = -Infinity; // of performance.now()
     this.revision = 0;
     this.report = {};
     this.state = "connecting";
@@ -17,7 +18,7 @@ export class LiveMap {
 
   open() {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    this.socket = new WebSocket(`${scheme}://${location.host}/api/maps/${this.name}/live`);
+    this.socket = new WebSocket(`${scheme}://${location.host}/api/maps/${encodeURIComponent(this.name)}/live`);
     this.socket.onmessage = (event) => this.take(JSON.parse(event.data));
     this.socket.onclose = (event) => {
       if (this.closed) return;
@@ -32,21 +33,28 @@ export class LiveMap {
     this.socket.close();
   }
 
-  // An estimate brings everything; a delta what changed.
+  // An estimate brings everything; a delta what changed.  Of an estimate of the same map it is seen what did.
   take(message) {
-    if (message.type === "estimate") this.variables.clear();
+    const before = this.variables, same = this.epoch === message.epoch;
+    if (message.type === "estimate") this.variables = new Map();
     this.touched = new Set();
     for (const { kind, keys, values } of message.variables) {
       keys.forEach((key, i) => {
+        const known = before.get(key)?.value;
+        if (message.type === "delta" || (same && !values[i].every((each, n) => each === known?.[n]))) this.touched.add(key);
         this.variables.set(key, { kind, value: values[i] });
-        if (message.type === "delta") this.touched.add(key);
       });
     }
+    this.epoch = message.epoch;
+    if (this.touched.size) this.touchedAt = performance.now();
     this.revision = message.revision;
     this.report = message.report ?? {};
     this.state = "live";
     this.changed();
   }
+
+  // How fresh the last step is: 1 at once, 0 when so many milliseconds have gone by.
+  fresh(fades) { return Math.max(0, 1 - (performance.now() - this.touchedAt) / fades); }
 
   // x, y, z of a variable; undefined for one that is not there or has no place.
   placeOf(key) {
