@@ -40,7 +40,7 @@ def test_its_commands_run(spawn: Callable[..., Process]) -> None:
     bridge = spawn("-m", "factorbus.cli", *join[:3], at, "--ros", router)
     assert bridge.ready() == [router]
     with ros.session(router) as bus:
-        tokens = ros.RosNode(bus, 0).wait_for_endpoints(6)
+        tokens = ros.RosNode(bus, 0).wait_for_endpoints(7)
         assert any(token.endswith("/NN/%/%/factorbus") for token in tokens)
     bridge.signal(signal.SIGINT)
     assert bridge.wait() == 0

@@ -160,7 +160,8 @@ def _covariance_of(topic: str, first: GraphNode, second: GraphNode, numbers: F64
     if not (values[0] > _SINGULAR * values[-1] > 0.0 and np.allclose(part, part.T, atol=1e-6)):
         raise BadRosEdge(topic, edge, "an information that is not positive definite", "a symmetric one that is")
     covariance = np.diag(np.full(6, UNKNOWN))
-    covariance[np.ix_(axes, axes)] = (vectors / values) @ vectors.T / scale
+    with np.errstate(over="ignore"):  # what is too large is found where the covariance is checked
+        covariance[np.ix_(axes, axes)] = (vectors / values) @ vectors.T / scale
     return covariance
 
 
