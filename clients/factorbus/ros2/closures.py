@@ -57,7 +57,7 @@ class _SeenEdge:
     state: str
 
 
-class Closures:
+class GraphClosures:
     """Which nodes and edges of graphs are known.
 
     place: where the robot was at a time, by odometry.  Raises BadRosMessage: that is not known, and never will be;
@@ -231,7 +231,7 @@ class Closures:
         self._notes.remark(topic, text)
 
     def _tell_removed(self, topic: str, heard: HeardGraph) -> None:
-        """Closures in the map whose ends the message names, but which it has no more."""
+        """GraphClosures in the map whose ends the message names, but which it has no more."""
         if not heard.named:
             return
         there = {_name(edge) for edge in heard.edges}

@@ -16,14 +16,14 @@ from factorbus.client.draft import Draft
 from factorbus.proto.arrays import F64
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.certainty import information
-from factorbus.ros2.closures import Closures, NodePlace
+from factorbus.ros2.closures import GraphClosures, NodePlace
 from factorbus.ros2.fixes import Antenna, GnssFixes, read_fix
 from factorbus.ros2.geometry import Transform, carried, local
-from factorbus.ros2.graphs import read_graph
+from factorbus.ros2.graphs import heard_graph
 from factorbus.ros2.message_parts import Notes, stamp_ns_of, transform_of
 from factorbus.ros2.messages import DETECTIONS, FIX, ODOMETRY, POSE
 from factorbus.ros2.mounts import Mounts
-from factorbus.ros2.observations import Observations, cross_matrix
+from factorbus.ros2.observations import LandmarkReader, cross_matrix
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
@@ -51,8 +51,8 @@ class FrontEnd:
         self._track, self._notes = OdometryTrack(), Notes()
         self._waiting: deque[tuple[int, str, Any, _Use]] = deque(maxlen=_WAITING)
         self._mounts = Mounts(settings.mounts)
-        self._observations = Observations(settings, self._mount, self._notes)
-        self._closures = Closures(settings, self._try_node_place, self._notes)
+        self._observations = LandmarkReader(settings, self._mount, self._notes)
+        self._closures = GraphClosures(settings, self._try_node_place, self._notes)
         self._fixes = GnssFixes(settings, frame, self._notes)
         self.refused, self.remarks = self._notes.refused, self._notes.remarks
         self.odometry_frame, self.base_frame = "", ""
@@ -143,7 +143,7 @@ class FrontEnd:
     def graph(self, topic: str, type_name: str, message: Any) -> Draft | None:
         """A pose_graph_tools_msgs/PoseGraph, rtabmap_msgs/MapGraph or rtabmap_msgs/Link.  Raises BadRosMessage."""
         draft = Draft()
-        self._closures.hear(topic, read_graph(topic, type_name, message, self._settings.rotation_first), draft)
+        self._closures.hear(topic, heard_graph(topic, type_name, message, self._settings.rotation_first), draft)
         return None if _is_empty(draft) else draft
 
     def _sample(self, message: Any) -> Sample:
@@ -273,7 +273,7 @@ class FrontEnd:
         return mount.t
 
     def _try_node_place(self, topic: str, stamp_ns: int) -> NodePlace | None:
-        """Where a node of a graph is, as `Closures` wants it."""
+        """Where a node of a graph is, as `GraphClosures` wants it."""
         if self._track.latest is None or stamp_ns > self.stamp_ns:
             return None
         self._check_covered(stamp_ns, topic)

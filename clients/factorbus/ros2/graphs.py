@@ -69,7 +69,7 @@ class HeardGraph:
     bad: list[BadRosMessage] = field(default_factory=list)
 
 
-def read_graph(topic: str, type_name: str, message: Any, rotation_first: bool) -> HeardGraph:
+def heard_graph(topic: str, type_name: str, message: Any, rotation_first: bool) -> HeardGraph:
     """Of a message of one of the three types.  Raises BadRosMessage: nothing of it can be used."""
     if type_name == POSE_GRAPH:
         return _pose_graph(topic, message, rotation_first)

@@ -26,7 +26,7 @@ class Observed(NamedTuple):
     information: F64
 
 
-class Observations:
+class LandmarkReader:
     """Reads detections.  mount: T_base_sensor of a frame; raises BadRosMessage where that is not known."""
 
     def __init__(self, settings: Settings, mount: Callable[[str, str], Transform], notes: Notes) -> None:
