@@ -11,6 +11,8 @@ import recordings
 import ros
 import survey
 from recordings import Said
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from factorbus.cli.driving.local import LocalMap
 from factorbus.cli.main import main
@@ -143,3 +145,63 @@ def test_it_is_the_same_from_each_kind_of_recording(tmp_path: Path) -> None:
     other = read_recording(recordings.write_rosbag2(tmp_path / "survey", messages), FOUND)
     for one, two in zip(reference.steps, other.steps, strict=True):
         assert [g.measured.tobytes() for g in one.factors] == [g.measured.tobytes() for g in two.factors]
+
+
+@pytest.mark.parametrize("graph", [POSE_GRAPH, MAP_GRAPH])
+def test_graphs_of_ros_1_are_read_by_their_former_names(graph: str, tmp_path: Path) -> None:
+    """The first generation of PoseGraph has no robots, and RTAB-Map's names were in camel case."""
+    odometry = survey.said(MADE, "", False)[1:10]
+    store = get_typestore(Stores.ROS1_NOETIC)
+    for name, text in FORMER.items():
+        store.register(get_types_from_msg(text, name))
+    types = store.types
+
+    def header(n: int) -> Any:
+        return types["std_msgs/msg/Header"](0, types["builtin_interfaces/msg/Time"](survey.at(n) // 10**9, 0), "map")
+
+    vector = types["geometry_msgs/msg/Vector3"](0.5, 0.25, 0.0)
+    place = types["geometry_msgs/msg/Point"](0.5, 0.25, 0.0), types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    pose = types["geometry_msgs/msg/Pose"](*place)
+    covariance = np.diag(np.full(6, 0.01)).ravel()
+    former = {POSE_GRAPH: "pose_graph_tools/msg/PoseGraph", MAP_GRAPH: "rtabmap_ros/msg/MapGraph"}[graph]
+    with Writer(tmp_path / "drive.bag") as writer:
+        driven = writer.add_connection("/odom", odometry[0].type_name, typestore=store)
+        graphs = writer.add_connection("/graph", former, typestore=store)
+        for n, each in enumerate(odometry):
+            read = recordings.STORE.read("/odom", each.type_name, each.cdr)
+            made = recordings._ros1(store, each.type_name, read)
+            writer.write(driven, each.ns, store.serialize_ros1(made, each.type_name))
+            if graph == POSE_GRAPH:
+                node = types["pose_graph_tools/msg/PoseGraphNode"](header(n), n, pose)
+                edge = types["pose_graph_tools/msg/PoseGraphEdge"](header(n), 1, n, 1, pose, covariance)
+                message = types[former](header(n), [node], [edge] if n == 7 else [])
+            else:
+                there = types["geometry_msgs/msg/Transform"](vector, place[1])
+                link = types["rtabmap_ros/msg/Link"](2, n + 1, 1, there, np.diag(np.full(6, 100.0)).ravel())
+                numbers = np.arange(1, n + 2, dtype=np.int32)
+                message = types[former](header(n), there, numbers, [pose] * (n + 1), [link] if n >= 7 else [])
+            writer.write(graphs, each.ns + 1, store.serialize_ros1(message, former))
+    made = read_recording(tmp_path / "drive.bag", FOUND)
+    assert any(note.startswith("closures: /graph") for note in made.notes)
+    groups = [g for batch in made.steps for g in batch.factors if g.kind == "between_se2"]
+    pairs = {tuple(keys): row for g in groups for keys, row in zip(g.keys.tolist(), g.measured, strict=True)}
+    np.testing.assert_allclose(pairs[symbol("x", 1), symbol("x", 7)], [0.5, 0.25, 0.0])
+
+
+FORMER = {
+    "pose_graph_tools/msg/PoseGraphNode": "std_msgs/Header header\nuint64 key\ngeometry_msgs/Pose pose",
+    "pose_graph_tools/msg/PoseGraphEdge": (
+        "std_msgs/Header header\nuint64 key_from\nuint64 key_to\nint32 type\ngeometry_msgs/Pose pose\n"
+        "float64[36] covariance"
+    ),
+    "pose_graph_tools/msg/PoseGraph": (
+        "std_msgs/Header header\npose_graph_tools/PoseGraphNode[] nodes\npose_graph_tools/PoseGraphEdge[] edges"
+    ),
+    "rtabmap_ros/msg/Link": (
+        "int32 fromId\nint32 toId\nint32 type\ngeometry_msgs/Transform transform\nfloat64[36] information"
+    ),
+    "rtabmap_ros/msg/MapGraph": (
+        "std_msgs/Header header\ngeometry_msgs/Transform mapToOdom\nint32[] posesId\ngeometry_msgs/Pose[] poses\n"
+        "rtabmap_ros/Link[] links"
+    ),
+}

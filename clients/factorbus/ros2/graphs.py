@@ -85,9 +85,7 @@ def heard_graph(topic: str, type_name: str, message: Any, rotation_first: bool) 
 def _pose_graph(topic: str, message: Any, rotation_first: bool) -> HeardGraph:
     made = HeardGraph()
     for each in message.nodes:
-        # The first generation of the message has no robot with its nodes: that of its edges counts.
-        robot = each.robot_id if hasattr(each, "robot_id") else next((e.robot_from for e in message.edges), 0)
-        node = GraphNode("kimera", int(robot), int(each.key))
+        node = GraphNode("kimera", _robot(each, "robot_id"), int(each.key))
         made.named.add(node)
         try:
             made.stamps[node] = stamp_ns_of(topic, each.header.stamp)
@@ -116,8 +114,8 @@ def _read_edges(topic: str, made: HeardGraph, edges: Any, read: Callable[[str, A
 
 
 def _pose_graph_edge(topic: str, each: Any, rotation_first: bool) -> GraphEdge:
-    first = GraphNode("kimera", int(each.robot_from), int(each.key_from))
-    second = GraphNode("kimera", int(each.robot_to), int(each.key_to))
+    first = GraphNode("kimera", _robot(each, "robot_from"), int(each.key_from))
+    second = GraphNode("kimera", _robot(each, "robot_to"), int(each.key_to))
     kind = _POSE_GRAPH_TYPES.get(int(each.type), f"type {each.type}")
     covariance = np.asarray(each.covariance, np.float64).reshape(6, 6)
     if rotation_first:
@@ -173,6 +171,11 @@ def edge_text(first: GraphNode, second: GraphNode) -> str:
 def bad_edge(topic: str, first: GraphNode, second: GraphNode, bad: BadRosMessage) -> BadRosEdge:
     """What is wrong with a part of an edge, said of the edge."""
     return BadRosEdge(topic, edge_text(first, second), str(bad.detail["seen"]), str(bad.detail["wanted"]))
+
+
+def _robot(message: Any, name: str) -> int:
+    """Whose it is; the first generation of the message, of ROS 1, has one robot alone, and no field for it."""
+    return int(getattr(message, name, 0))
 
 
 def _either(message: Any, name: str, former: str) -> Any:
