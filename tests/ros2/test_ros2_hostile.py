@@ -281,7 +281,7 @@ class Listening:
     def __init__(self) -> None:
         self.hear: dict[str, Any] = {}
 
-    def subscribe(self, topic: Any, hear: Any) -> None:
+    def subscribe(self, topic: Any, hear: Any, _kept: bool) -> None:
         self.hear[topic.name] = hear
 
     def publisher(self, _topic: Any) -> "Listening":
@@ -317,7 +317,8 @@ def test_a_bridge_says_once_what_it_did_and_survives_a_fault_of_its_own(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node, joined, stop = Listening(), FakeMap(), threading.Event()
-    bridge = Bridge(joined, node, MESSAGES, Settings(space="space", display_s=60.0))  # type: ignore[arg-type]
+    topics = Settings(space="space", display_s=60.0, pose_graphs=("/graph",), fixes=("/fix",))
+    bridge = Bridge(joined, node, MESSAGES, topics)  # type: ignore[arg-type]
     detections = FrontEnd.detections
 
     def fails(front_end: FrontEnd, topic: str, message: Any) -> Draft | None:
@@ -335,12 +336,21 @@ def test_a_bridge_says_once_what_it_did_and_survives_a_fault_of_its_own(
             told = ros.odometry(n * SECOND, (float(n), 0.0, 0.0))
             told.twist.covariance = covariance(0.01, 0.01, LARGEST, 1e308, 1e308, 0.01)
             node.hear["/odom"](bytes(told.serialize()))
-        drafts = [joined.sent.get(timeout=30) for _ in range(5)]
+            node.hear["/fix"](bytes(ros.nav_fix(n * SECOND, (91.0, 11.0, 500.0)).serialize()))
+            graph = ros.pose_graph(n * SECOND, {n: n * SECOND}, [(1, n, 1, (1, 0, 0))] if n > 1 else [], [math.nan] * 6)
+            node.hear["/graph"](bytes(graph.serialize()))
+            turned, _, _, (turn,) = plain(TRANSFORMS, n * SECOND)
+            turn.w = 0.0
+            node.hear["/tf_static"](bytes(turned.serialize()))
+        node.hear["/odom"](bytes(ros.odometry(6 * SECOND, (6.0, 0.0, 0.0)).serialize()))  # after all of it
+        drafts = [joined.sent.get(timeout=30) for _ in range(6)]
         stop.set()
         running.join(30)
-    assert [draft.batch().variables[0].keys.tolist() for draft in drafts] == [[symbol("x", n)] for n in range(5)]
+    assert [draft.batch().variables[0].keys.tolist() for draft in drafts] == [[symbol("x", n)] for n in range(6)]
     said = [record.getMessage() for record in caplog.records]
     assert len([text for text in said if text.startswith("/odom: twist: a covariance with a variance of")]) == 1
-    assert len([text for text in said if "[bad_ros_message]" in text]) == 1
+    refused = [text.split(":")[0] for text in said if "[bad_ros_message]" in text]
+    assert sorted(refused) == ["/fix", "/graph", "/odom", "/tf_static"], "the first on each topic"
+    assert len([text for text in said if text.startswith("/graph: robot 0 of the graph is this one")]) == 1
     assert len([text for text in said if "ZeroDivisionError: as if" in text and "[internal]" in text]) == 1
-    assert (bridge.counts["internal"], bridge.counts["bad_ros_message"], bridge.counts["remarks"]) == (5, 5, 5)
+    assert (bridge.counts["internal"], bridge.counts["bad_ros_message"], bridge.counts["remarks"]) == (5, 19, 6)
