@@ -10,7 +10,7 @@ from typing import Any
 import words
 import xxhash
 import zenoh
-from zenoh.ext import Int64, UInt8, z_deserialize, z_serialize
+from zenoh.ext import CacheConfig, Int64, UInt8, declare_advanced_publisher, z_deserialize, z_serialize
 from zenoh.handlers import Callback
 
 
@@ -22,6 +22,7 @@ def session(endpoint: str) -> zenoh.Session:
         "connect/endpoints": [endpoint],
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
+        "timestamping/enabled": True,  # as rmw_zenoh has it: what is kept for late subscribers needs it
     }.items():
         config.insert_json5(path, json.dumps(value))
     return zenoh.open(config)
@@ -49,6 +50,14 @@ class RosNode:
         gid = [UInt8(byte) for byte in self._gid]
         head = bytes(z_serialize(Int64(next(self._sequence)))) + bytes(z_serialize(Int64(time.time_ns())))
         self._publishers[topic].put(bytes(message.serialize()), attachment=head + bytes(z_serialize(gid)))
+
+    def latch(self, topic: str, message: Any) -> None:
+        """Publish what late subscribers get, too (transient local), as rmw_zenoh does."""
+        made = declare_advanced_publisher(
+            self._bus, topic_key(self._domain, topic, type(message)), cache=CacheConfig(100), publisher_detection=True
+        )
+        self._kept.append(made)
+        made.put(bytes(message.serialize()))
 
     def subscribe(self, topic: str, cls: Any) -> None:
         def hear(sample: zenoh.Sample) -> None:
@@ -162,3 +171,41 @@ def known_pose(ns: int, where: tuple[float, float, float], variances: list[float
     return words.PoseWithCovarianceStamped(
         words.Header(stamp(ns), "map"), words.PoseWithCovariance(pose(*where), diagonal(*variances))
     )
+
+
+def pose_graph(
+    ns: int, nodes: dict[int, int], edges: list[tuple[int, int, int, tuple[float, float, float]]],
+    variances: list[float] | None = None, robot: int = 0,
+) -> Any:  # fmt: skip
+    """nodes: key to its time.  edges: from, to, type, where the second is in the first's frame."""
+    covariance = diagonal(*(variances or [0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4]))
+    made = [
+        words.PoseGraphNode(words.Header(stamp(at), "odom"), robot, key, pose(0, 0, 0)) for key, at in nodes.items()
+    ]
+    joined = [
+        words.PoseGraphEdge(words.Header(stamp(ns), "odom"), a, b, robot, robot, kind, pose(*where), list(covariance))
+        for a, b, kind, where in edges
+    ]
+    return words.PoseGraph(words.Header(stamp(ns), "world"), made, joined)
+
+
+def link(a: int, b: int, kind: int, where: tuple[float, float, float], variances: list[float] | None = None) -> Any:
+    of = pose(*where)
+    there = words.Transform(words.Vector3(of.position.x, of.position.y, of.position.z), of.orientation)
+    information = [1.0 / each for each in (variances or [0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4])]
+    return words.Link(a, b, kind, there, diagonal(*information))
+
+
+def map_graph(ns: int, numbers: list[int], links: list[Any]) -> Any:
+    still = words.Transform(words.Vector3(0.0, 0.0, 0.0), words.Quaternion(0.0, 0.0, 0.0, 1.0))
+    return words.MapGraph(words.Header(stamp(ns), "map"), still, numbers, [pose(0.0, 0.0, 0.0) for _ in numbers], links)
+
+
+def nav_fix(
+    ns: int, place: tuple[float, float, float], sigmas: tuple[float, float, float] = (0.5, 0.5, 1.0), kind: int = 2,
+    status: int = 0, frame: str = "gps",
+) -> Any:  # fmt: skip
+    """place: latitude, longitude, altitude.  kind: of the covariance."""
+    covariance = [0.0] * 9
+    covariance[::4] = [sigma**2 for sigma in sigmas]
+    return words.NavSatFix(words.Header(stamp(ns), frame), words.NavSatStatus(status, 1), *place, covariance, kind)

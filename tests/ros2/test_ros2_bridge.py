@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import ros
+import survey
 import words
 import xxhash
 from browser import free_port
@@ -81,6 +82,7 @@ def there_is(tokens: list[str], domain: int, gid: str) -> None:
         ("MS", "%odom", "nav_msgs::msg::dds_::Odometry_", "::,10:,:,:,,"),
         ("MS", "%initialpose", "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_", "::,10:,:,:,,"),
         ("MS", "%detections", "vision_msgs::msg::dds_::Detection3DArray_", "::,10:,:,:,,"),
+        ("MS", "%tf_static", "tf2_msgs::msg::dds_::TFMessage_", ":1:,100:,:,:,,"),  # with what was said before
     }
     (tf,) = [token for token in tokens if "/%tf/" in token]
     number = xxhash.xxh3_128_intdigest(tf.encode())
@@ -103,7 +105,7 @@ def test_what_cannot_be_used_is_refused_and_the_rest_goes_on(
     endpoint: str, spawn: Callable[..., Process], node: Any
 ) -> None:
     joined = bridge(spawn, endpoint, "refusing", 9)
-    node.wait_for_endpoints(6)
+    node.wait_for_endpoints(7)
     bad = ros.odometry(SECOND, (0.0, 0.0, 0.0))
     bad.pose.covariance[0] = -1.0
     node.publish("/odom", bad)
@@ -133,7 +135,7 @@ def test_a_map_that_is_not_empty_waits_for_a_pose(endpoint: str, spawn: Callable
     with connect(endpoint, client="first") as bus, bus.map("shared") as looked:
         looked.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
         joined = bridge(spawn, endpoint, "shared", 9, "--letter", "a")
-        node.wait_for_endpoints(6)
+        node.wait_for_endpoints(7)
         for n in range(1, 4):
             node.publish("/odom", ros.odometry(n * SECOND, (float(n), 0.0, 0.0)))
         node.publish("/initialpose", ros.known_pose(3 * SECOND, (5.0, 5.0, math.pi / 2), [0.01] * 6))
@@ -147,7 +149,7 @@ def test_a_map_that_is_not_empty_waits_for_a_pose(endpoint: str, spawn: Callable
 
 def test_a_map_that_is_made_anew_is_begun_anew(endpoint: str, spawn: Callable[..., Process], node: Any) -> None:
     joined = bridge(spawn, endpoint, "dropped", 9)
-    node.wait_for_endpoints(6)
+    node.wait_for_endpoints(7)
     with connect(endpoint, client="operator") as bus:
         node.publish("/odom", ros.odometry(SECOND, (0.0, 0.0, 0.0)))
         node.wait_for("/tf")
@@ -181,7 +183,7 @@ def test_a_service_that_is_killed_costs_nothing(spawn: Callable[..., Process], t
     with ros.session(router) as bus:
         robot = ros.RosNode(bus, 10)
         robot.subscribe("/tf", words.TFMessage)
-        robot.wait_for_endpoints(6)
+        robot.wait_for_endpoints(7)
 
         def drive(first: int, last: int) -> None:
             for n in range(first, last):
@@ -207,3 +209,45 @@ def test_a_service_that_is_killed_costs_nothing(spawn: Callable[..., Process], t
             assert len(keys) >= 60
     joined.signal(signal.SIGINT)
     assert joined.wait() == 0
+
+
+def test_a_front_end_with_closures_and_gnss_makes_the_map_of_the_same_graph(
+    endpoint: str, spawn: Callable[..., Process]
+) -> None:
+    """Its frames were published before the bridge came, as robots do at their start."""
+    made = survey.survey()
+    static, *said = survey.said(made)
+    with (
+        ros.session(endpoint) as bus,
+        connect(endpoint, client="looker") as looking,
+        looking.map("surveyed") as looked,
+        looking.map("drafted") as other,
+    ):
+        robot = ros.RosNode(bus, 11)
+        robot.latch("/tf_static", static.message)
+        robot.subscribe("/factorbus/path", words.Path)
+        robot.subscribe("/factorbus/markers", words.MarkerArray)
+        topics = ("--pose-graph", "/kimera/pose_graph", "--fix", "/gps/fix")
+        joined = bridge(spawn, endpoint, "surveyed", 11, "--display", "0.1", *topics)
+        robot.wait_for_endpoints(9)
+        for each in said:
+            robot.publish(each.topic, each.message)
+        other.insert(survey.drafted(made))
+        wanted = other.graph().batch.factor_count
+        while looked.graph().batch.factor_count < wanted:
+            looked.estimate.wait_for(looked.estimate.revision + 1)
+        looked.settle()
+        other.settle()
+        assert looked.chi2().chi2 == pytest.approx(other.chi2().chi2, rel=1e-6)
+        for estimate in (looked.estimate, other.estimate):
+            estimate.wait_for(estimate.revision)
+        np.testing.assert_allclose(looked.estimate.columns("se2")[1], other.estimate.columns("se2")[1], atol=1e-4)
+        while len(robot.wait_for("/factorbus/path")[0].poses) < survey.COUNT:
+            pass
+        _, poses = robot.wait_for("/factorbus/markers")[0].markers
+        assert len(poses.points) == survey.COUNT, "the frame of GNSS is no pose of the robot"
+    joined.signal(signal.SIGINT)
+    assert joined.wait() == 0
+    log = joined.errors()
+    for text in ("the origin of GNSS is", "GNSS's frame f0 by", "its edges of odometry are left out"):
+        assert log.count(text) == 1, text

@@ -14,7 +14,7 @@ from factorbus.client import Draft
 from factorbus.proto.messages import Factors
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.certainty import checked_covariance, floored
-from factorbus.ros2.front_end import FrontEnd, landmark_index
+from factorbus.ros2.front_end import FrontEnd
 from factorbus.ros2.geometry import (
     Transform,
     adjoint,
@@ -27,6 +27,7 @@ from factorbus.ros2.geometry import (
     rotation_vector,
 )
 from factorbus.ros2.messages import DETECTIONS, ODOMETRY, POSE, Messages
+from factorbus.ros2.observations import landmark_index
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Floors, Settings
 from factorbus.ros2.space import SPACES

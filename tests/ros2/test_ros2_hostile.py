@@ -21,7 +21,17 @@ from factorbus.proto.symbols import symbol
 from factorbus.ros2.bridge import Bridge
 from factorbus.ros2.certainty import checked_covariance, information
 from factorbus.ros2.front_end import FrontEnd
-from factorbus.ros2.messages import DETECTIONS, ODOMETRY, POSE, Messages
+from factorbus.ros2.messages import (
+    DETECTIONS,
+    FIX,
+    LINK,
+    MAP_GRAPH,
+    ODOMETRY,
+    POSE,
+    POSE_GRAPH,
+    TRANSFORMS,
+    Messages,
+)
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.solver import Options, Solver, SolverError
@@ -29,7 +39,10 @@ from factorbus.solver import Options, Solver, SolverError
 MESSAGES = Messages("jazzy")
 SECOND = 10**9
 LARGEST = sys.float_info.max
-TOPICS = {ODOMETRY: "/odom", POSE: "/initialpose", DETECTIONS: "/detections"}
+TOPICS = {
+    ODOMETRY: "/odom", POSE: "/initialpose", DETECTIONS: "/detections", FIX: "/fix", POSE_GRAPH: "/graph",
+    MAP_GRAPH: "/mapGraph", LINK: "/link", TRANSFORMS: "/tf_static",
+}  # fmt: skip
 WILD = (
     0.0, -0.0, 5e-324, -5e-324, 1e-160, 1e9, -1e9, 1.1e9, 1e12, 1e154, -1e154, 1e155, 1e300, 1e308, LARGEST, -LARGEST,
     -1.0, 1.0, math.inf, -math.inf, math.nan,
@@ -59,7 +72,7 @@ class Robot:
     def __init__(self, space: str) -> None:
         self.front_end = FrontEnd(Settings(space=space), 0, (), False)
         self.solver, self.ns = Solver(Options()), SECOND
-        self.inserted = self.refused = self.unused = 0
+        self.inserted = self.refused = self.unused = self.said = 0
 
     def hear(self, type_name: str, data: bytes) -> None:
         topic = TOPICS[type_name]
@@ -69,13 +82,19 @@ class Robot:
         except BadRosMessage:
             self.unused += 1
             return
+        finally:
+            self.said += len(self.front_end.refused) + len(self.front_end.remarks)
+            assert all(each.code == "bad_ros_message" for each in self.front_end.refused)
+            self.front_end.refused.clear()
+            self.front_end.remarks.clear()
         if draft is not None:
             self.insert(draft.batch())
 
     def draft(self, topic: str, type_name: str, message: Any) -> Draft | None:
-        if type_name == ODOMETRY:
-            return self.front_end.odometry(message)
-        return self.front_end.pose(topic, message) if type_name == POSE else self.front_end.detections(topic, message)
+        if type_name == TRANSFORMS:
+            self.front_end.static(topic, message)
+            return None
+        return self.front_end.take(topic, type_name, message)
 
     def insert(self, batch: Batch) -> None:
         assert all(np.isfinite(group.measured).all() for group in batch.factors)
@@ -98,29 +117,67 @@ class Robot:
         self.hear(ODOMETRY, bytes(ros.odometry(self.ns, (self.ns / SECOND, 0.0, 0.0), [1e-4] * 6).serialize()))
 
 
-def message(type_name: str, ns: int, numbers: random.Random, space: bool = False) -> Any:
+def message(type_name: str, ns: int, numbers: random.Random) -> Any:
     """One with extreme values in a few of its places."""
-    if type_name == ODOMETRY:
-        made = ros.odometry(ns, (ns / SECOND, 0.0, 0.0), [1e-4] * 6)
-        covariances, places = [made.pose.covariance, made.twist.covariance], [made.pose.pose]
-    elif type_name == POSE:
-        made = ros.known_pose(ns, (ns / SECOND, 0.0, 0.0), [0.1] * 6)
-        covariances, places = [made.pose.covariance], [made.pose.pose]
-    else:
-        made = ros.detections(ns, "base_link", [(str(n), (1.0 + n, 2.0, 0.0), 0.1) for n in range(3)])
-        covariances = [seen.results[0].pose.covariance for seen in made.detections]
-        places = [seen.results[0].pose.pose for seen in made.detections]
+    made, covariances, points, turns = plain(type_name, ns)
     for covariance in covariances:
+        size = math.isqrt(len(covariance))
+        diagonal = range(0, size**2, size + 1)
         for _ in range(numbers.choice((0, 1, 1, 2, 6))):
-            covariance[numbers.choice((0, 7, 14, 21, 28, 35, numbers.randrange(36)))] = numbers.choice(WILD)
+            covariance[numbers.choice((*diagonal, numbers.randrange(size**2)))] = numbers.choice(WILD)
     if numbers.random() < 0.3:
-        pose = numbers.choice(places)
-        setattr(pose.position, numbers.choice("xyz"), numbers.choice(WILD))
-    if numbers.random() < 0.2:
-        setattr(numbers.choice(places).orientation, numbers.choice("xyzw"), numbers.choice(WILD))
-    if numbers.random() < 0.1:
+        point = numbers.choice(points)
+        names = "xyz" if hasattr(point, "x") else ("latitude", "longitude", "altitude")
+        setattr(point, numbers.choice(names), numbers.choice(WILD))
+    if turns and numbers.random() < 0.2:
+        setattr(numbers.choice(turns), numbers.choice("xyzw"), numbers.choice(WILD))
+    if hasattr(made, "header") and numbers.random() < 0.1:
         made.header.stamp = words.Time(numbers.choice((-(2**31), -1, 0, 2**31 - 1)), numbers.choice((0, 2**32 - 1)))
     return made
+
+
+def plain(type_name: str, ns: int) -> tuple[Any, list[Any], list[Any], list[Any]]:
+    """A message with nothing wrong in it, its covariances, its points and its quaternions."""
+    n = ns // SECOND
+    at = (ns / SECOND, 0.0, 0.0)
+    if type_name == FIX:
+        fix = ros.nav_fix(ns, (48.0, 11.0 + 1e-5 * at[0], 500.0), kind=n % 4, frame="camera")
+        return fix, [fix.position_covariance], [fix], []
+    if type_name == DETECTIONS:
+        made = ros.detections(ns, "base_link", [(str(k), (1.0 + k, 2.0, 0.0), 0.1) for k in range(3)])
+        results = [seen.results[0].pose for seen in made.detections]
+    elif type_name == ODOMETRY:
+        made = ros.odometry(ns, at, [1e-4] * 6)
+        results = [made.pose]
+    elif type_name == POSE:
+        made = ros.known_pose(ns, at, [0.1] * 6)
+        results = [made.pose]
+    elif type_name == POSE_GRAPH:
+        edges = [
+            (max(n - k, 0), n - 1, kind, (float(k), 0.0, 0.0)) for k, kind in ((9, 1), (4, 1), (2, 0), (5, 3), (3, 9))
+        ]
+        made = ros.pose_graph(ns, {n: ns, n - 1: ns - SECOND}, edges)
+        poses = [edge.pose for edge in made.edges]
+        covariances = [edge.covariance for edge in made.edges]
+        return made, covariances, [each.position for each in poses], [each.orientation for each in poses]
+    else:
+        return of_transforms(type_name, ns)
+    covariances = [each.covariance for each in results]
+    covariances += [made.twist.covariance] if type_name == ODOMETRY else []
+    return made, covariances, [each.pose.position for each in results], [each.pose.orientation for each in results]
+
+
+def of_transforms(type_name: str, ns: int) -> tuple[Any, list[Any], list[Any], list[Any]]:
+    """The same of messages that have no poses but transforms."""
+    n = ns // SECOND
+    if type_name == TRANSFORMS:
+        there = words.Transform(words.Vector3(0.1, 0.0, 0.2), words.Quaternion(0.0, 0.0, 0.0, 1.0))
+        made = words.TFMessage([words.TransformStamped(words.Header(ros.stamp(ns), "base_link"), "camera", there)])
+        return made, [], [there.translation], [there.rotation]
+    links = [ros.link(n, n - k, kind, (-float(k), 0.0, 0.0)) for k, kind in ((8, 1), (3, 2), (1, 0), (0, 7))]
+    made = links[0] if type_name == LINK else ros.map_graph(ns, list(range(max(n - 20, 1), n + 1)), links)
+    of = [each.transform for each in links]
+    return made, [each.information for each in links], [each.translation for each in of], [each.rotation for each in of]
 
 
 @pytest.mark.parametrize("space", ["plane", "space"])
@@ -130,7 +187,7 @@ def test_extreme_numbers_leave_the_map_finite(space: str, record_property: Any) 
     print("seed", seed)
     numbers, robot = random.Random(seed), Robot(space)
     robot.drive()
-    for n in range(1200):
+    for n in range(600):
         if n % 40 == 0:  # a map of its own: what is taken in makes each step longer
             robot = Robot(space)
             robot.drive()
@@ -138,6 +195,7 @@ def test_extreme_numbers_leave_the_map_finite(space: str, record_property: Any) 
         for type_name in TOPICS:
             robot.hear(type_name, bytes(message(type_name, robot.ns, numbers).serialize()))
         robot.drive()
+    assert robot.said, "what was wrong is told"
     before = robot.inserted
     robot.drive()
     assert robot.inserted == before + 1, "after all of this it still drives"
@@ -151,11 +209,14 @@ def test_mutants_of_messages_are_read_or_refused(type_name: str, record_property
     print("seed", seed)
     numbers = random.Random(seed)
     end = Robot("plane")
-    for n in range(MUTANTS // 3):
+    for n in range(MUTANTS // 6):
         if n % 200 == 0:
             end = Robot("plane")
             end.drive()
-        data = bytearray(bytes(message(type_name, end.ns + SECOND, numbers).serialize()))
+        if n % 4 == 0:
+            end.drive()
+        ahead = SECOND if type_name == ODOMETRY else 0
+        data = bytearray(bytes(message(type_name, end.ns + ahead, numbers).serialize()))
         for _ in range(numbers.choice((1, 1, 2, 8))):
             where = numbers.randrange(len(data))
             how = numbers.randrange(5)
@@ -220,7 +281,7 @@ class Listening:
     def __init__(self) -> None:
         self.hear: dict[str, Any] = {}
 
-    def subscribe(self, topic: Any, hear: Any) -> None:
+    def subscribe(self, topic: Any, hear: Any, _kept: bool) -> None:
         self.hear[topic.name] = hear
 
     def publisher(self, _topic: Any) -> "Listening":
@@ -256,7 +317,8 @@ def test_a_bridge_says_once_what_it_did_and_survives_a_fault_of_its_own(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node, joined, stop = Listening(), FakeMap(), threading.Event()
-    bridge = Bridge(joined, node, MESSAGES, Settings(space="space", display_s=60.0))  # type: ignore[arg-type]
+    topics = Settings(space="space", display_s=60.0, pose_graphs=("/graph",), fixes=("/fix",))
+    bridge = Bridge(joined, node, MESSAGES, topics)  # type: ignore[arg-type]
     detections = FrontEnd.detections
 
     def fails(front_end: FrontEnd, topic: str, message: Any) -> Draft | None:
@@ -274,12 +336,21 @@ def test_a_bridge_says_once_what_it_did_and_survives_a_fault_of_its_own(
             told = ros.odometry(n * SECOND, (float(n), 0.0, 0.0))
             told.twist.covariance = covariance(0.01, 0.01, LARGEST, 1e308, 1e308, 0.01)
             node.hear["/odom"](bytes(told.serialize()))
-        drafts = [joined.sent.get(timeout=30) for _ in range(5)]
+            node.hear["/fix"](bytes(ros.nav_fix(n * SECOND, (91.0, 11.0, 500.0)).serialize()))
+            graph = ros.pose_graph(n * SECOND, {n: n * SECOND}, [(1, n, 1, (1, 0, 0))] if n > 1 else [], [math.nan] * 6)
+            node.hear["/graph"](bytes(graph.serialize()))
+            turned, _, _, (turn,) = plain(TRANSFORMS, n * SECOND)
+            turn.w = 0.0
+            node.hear["/tf_static"](bytes(turned.serialize()))
+        node.hear["/odom"](bytes(ros.odometry(6 * SECOND, (6.0, 0.0, 0.0)).serialize()))  # after all of it
+        drafts = [joined.sent.get(timeout=30) for _ in range(6)]
         stop.set()
         running.join(30)
-    assert [draft.batch().variables[0].keys.tolist() for draft in drafts] == [[symbol("x", n)] for n in range(5)]
+    assert [draft.batch().variables[0].keys.tolist() for draft in drafts] == [[symbol("x", n)] for n in range(6)]
     said = [record.getMessage() for record in caplog.records]
     assert len([text for text in said if text.startswith("/odom: twist: a covariance with a variance of")]) == 1
-    assert len([text for text in said if "[bad_ros_message]" in text]) == 1
+    refused = [text.split(":")[0] for text in said if "[bad_ros_message]" in text]
+    assert sorted(refused) == ["/fix", "/graph", "/odom", "/tf_static"], "the first on each topic"
+    assert len([text for text in said if text.startswith("/graph: robot 0 of the graph is this one")]) == 1
     assert len([text for text in said if "ZeroDivisionError: as if" in text and "[internal]" in text]) == 1
-    assert (bridge.counts["internal"], bridge.counts["bad_ros_message"], bridge.counts["remarks"]) == (5, 5, 5)
+    assert (bridge.counts["internal"], bridge.counts["bad_ros_message"], bridge.counts["remarks"]) == (5, 19, 6)

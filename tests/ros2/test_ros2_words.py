@@ -17,7 +17,19 @@ from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
 from factorbus.ros2 import display, messages
 from factorbus.ros2.geometry import from_plane, from_quaternion
-from factorbus.ros2.messages import DETECTIONS, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
+from factorbus.ros2.messages import (
+    DETECTIONS,
+    FIX,
+    LINK,
+    MAP_GRAPH,
+    MARKERS,
+    ODOMETRY,
+    PATH,
+    POSE,
+    POSE_GRAPH,
+    TRANSFORMS,
+    Messages,
+)
 from factorbus.ros2.names import NodeName, Topic, attachment, gid
 from factorbus.ros2.options import BridgeOptions
 from factorbus.ros2.problems import BadRosMessage, BadRosName
@@ -31,6 +43,10 @@ TYPES = {
     PATH: words.Path,
     TRANSFORMS: words.TFMessage,
     MARKERS: words.MarkerArray,
+    FIX: words.NavSatFix,
+    POSE_GRAPH: words.PoseGraph,
+    MAP_GRAPH: words.MapGraph,
+    LINK: words.Link,
 }
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 
@@ -49,6 +65,8 @@ def test_names_are_those_of_the_design_document_of_rmw_zenoh() -> None:
         "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/10/MP/%/%/talker/%chatter/"
         f"std_msgs::msg::dds_::String_/{STRING}/::,7:,:,:,,"
     )
+    static = Topic("/tf_static", "tf2_msgs/msg/TFMessage", STRING, 100)
+    assert talker.endpoint_token(11, "MS", static, kept=True).endswith("/:1:,100:,:,:,,")
     assert NodeName("a", 0, "/robot1", "n").token() == "@ros2_lv/0/a/0/0/NN/%/%robot1/n"
 
 
@@ -67,6 +85,10 @@ def test_type_hashes_are_those_seen_on_robots() -> None:
         assert store.hash("std_msgs/msg/String") == STRING
         assert store.hash(ODOMETRY) == "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"
         assert store.hash(TRANSFORMS) == "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+        # As rosidl wrote them for the packages themselves.
+        assert store.hash(POSE_GRAPH) == "RIHS01_1010611eb14adb91140b5debb288865bf9881ad35835622b2e3a0fc5c905fb32"
+        assert store.hash(MAP_GRAPH) == "RIHS01_25c8097ccc472a2134e59113106a13302b0025829ef39e2066e2075fa84228c4"
+        assert store.hash(LINK) == "RIHS01_764301c2d5f3045b5f97420bd64629321ecef724a6010e3dfe5f5c3d4ce7ac0a"
         assert [store.hash(name) for name in TYPES] == [MESSAGES.hash(name) for name in TYPES]
     assert set(DISTRIBUTIONS) == set(messages.DISTRIBUTIONS)
 

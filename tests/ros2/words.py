@@ -1,6 +1,7 @@
 """ROS 2 messages by libraries that the bridge does not use: pycdr2 for CDR, zenoh-ros-type for definitions.
 
-What that does not define is written down here from the definitions of tf2_msgs, visualization_msgs and vision_msgs.
+What that does not define is written down here from the definitions of tf2_msgs, visualization_msgs, vision_msgs,
+pose_graph_tools_msgs and rtabmap_msgs.
 The type hashes are computed here too, from REP 2016: the SHA-256 of a description in JSON.
 """
 
@@ -11,19 +12,21 @@ from dataclasses import dataclass
 from typing import Any, get_args, get_origin
 
 from pycdr2 import IdlStruct
-from pycdr2.types import float32, float64, int32, sequence, uint8, uint32
+from pycdr2.types import array, float32, float64, int32, sequence, uint8, uint32, uint64
 from zenoh_ros_type.common_interfaces.geometry_msgs import (
     Point,
     Pose,
     PoseWithCovariance,
     PoseWithCovarianceStamped,
     Quaternion,
+    Transform,
     TransformStamped,
     Twist,
     TwistWithCovariance,
     Vector3,
 )
 from zenoh_ros_type.common_interfaces.nav_msgs import Odometry, Path
+from zenoh_ros_type.common_interfaces.sensor_msgs import NavSatFix, NavSatStatus
 from zenoh_ros_type.common_interfaces.std_msgs import Header
 from zenoh_ros_type.rcl_interfaces.builtin_interfaces import Time
 
@@ -126,6 +129,51 @@ class Detection3DArray(IdlStruct, typename="Detection3DArray"):
     detections: sequence[Detection3D]
 
 
+@dataclass
+class PoseGraphNode(IdlStruct, typename="PoseGraphNode"):
+    header: Header
+    robot_id: int32
+    key: uint64
+    pose: Pose
+
+
+@dataclass
+class PoseGraphEdge(IdlStruct, typename="PoseGraphEdge"):
+    header: Header
+    key_from: uint64
+    key_to: uint64
+    robot_from: int32
+    robot_to: int32
+    type: int32
+    pose: Pose
+    covariance: array[float64, 36]
+
+
+@dataclass
+class PoseGraph(IdlStruct, typename="PoseGraph"):
+    header: Header
+    nodes: sequence[PoseGraphNode]
+    edges: sequence[PoseGraphEdge]
+
+
+@dataclass
+class Link(IdlStruct, typename="Link"):
+    from_id: int32
+    to_id: int32
+    type: int32
+    transform: Transform
+    information: array[float64, 36]
+
+
+@dataclass
+class MapGraph(IdlStruct, typename="MapGraph"):
+    header: Header
+    map_to_odom: Transform
+    poses_id: sequence[int32]
+    poses: sequence[Pose]
+    links: sequence[Link]
+
+
 PACKAGES = {
     "builtin_interfaces": (Time, Duration),
     "std_msgs": (Header, ColorRGBA),
@@ -135,7 +183,9 @@ PACKAGES = {
     ),
     "nav_msgs": (Odometry, Path),
     "tf2_msgs": (TFMessage,),
-    "sensor_msgs": (CompressedImage,),
+    "sensor_msgs": (CompressedImage, NavSatFix, NavSatStatus),
+    "pose_graph_tools_msgs": (PoseGraphNode, PoseGraphEdge, PoseGraph),
+    "rtabmap_msgs": (Link, MapGraph),
     "visualization_msgs": (Marker, MarkerArray, MeshFile, UVCoordinate),
     "vision_msgs": (ObjectHypothesis, ObjectHypothesisWithPose, BoundingBox3D, Detection3D, Detection3DArray),
 }  # fmt: skip
@@ -148,7 +198,10 @@ def type_name(cls: type) -> str:
 
 
 # REP 2016: the ids of field types, and what is added for arrays and sequences.
-_IDS = {"int8": 2, "uint8": 3, "int32": 6, "uint32": 7, "float32": 10, "float64": 11, "bool": 15, "str": 17}
+_IDS = {
+    "int8": 2, "uint8": 3, "uint16": 5, "int32": 6, "uint32": 7, "uint64": 9, "float32": 10, "float64": 11, "bool": 15,
+    "str": 17,
+}  # fmt: skip
 _ARRAY, _SEQUENCE = 48, 144
 
 

@@ -6,6 +6,7 @@ import queue
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Mapping
 from typing import Any
 
 from factorbus.client import Draft, Map, PendingInsert, Problem, Refused, Unavailable
@@ -14,11 +15,11 @@ from factorbus.proto.messages import Delta
 from factorbus.proto.symbols import symbol
 from factorbus.ros2 import display
 from factorbus.ros2.front_end import FrontEnd
-from factorbus.ros2.messages import DETECTIONS, LATEST_S, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
+from factorbus.ros2.messages import LATEST_S, MARKERS, ODOMETRY, PATH, TRANSFORMS, Messages
 from factorbus.ros2.names import Topic
 from factorbus.ros2.node import Node
 from factorbus.ros2.problems import BadRosMessage, Unusable
-from factorbus.ros2.settings import Settings
+from factorbus.ros2.settings import FRAME_LETTER, STATIC, Settings
 from factorbus.ros2.space import SPACES
 
 log = logging.getLogger("factorbus.ros2")
@@ -29,6 +30,8 @@ _IDLE_S = 0.2
 # Drawing may take this share of the time.
 _DRAWING = 0.05
 _OTHER_MAP = ("wrong_epoch", "unknown_map")
+_STATIC_DEPTH = 100  # transforms that each publisher of them keeps for those who come late
+_REMARKS = 1000  # different ones that are logged
 
 
 class Bridge:
@@ -47,11 +50,9 @@ class Bridge:
         self._path = node.publisher(self._topic(settings.path, PATH, 1))
         self._markers = node.publisher(self._topic(settings.markers, MARKERS, 1))
         self._forget = joined.estimate.on_delta(self._on_delta)
-        self._listen(node, settings.odometry, ODOMETRY)
-        for name in settings.poses:
-            self._listen(node, name, POSE)
-        for name in settings.landmarks:
-            self._listen(node, name, DETECTIONS)
+        for name, type_name in settings.inputs().items():
+            self._listen(node, self._topic(name, type_name, 10))
+        self._listen(node, self._topic(STATIC, TRANSFORMS, _STATIC_DEPTH), kept=True)
         if self._front_end.waits_for_pose:
             log.warning("waiting for a pose on %s: %s", " or ".join(settings.poses), self._why_wait())
 
@@ -73,27 +74,26 @@ class Bridge:
             stop.set()
             drawing.join()
 
-    def _listen(self, node: Node, name: str, type_name: str) -> None:
+    def _listen(self, node: Node, topic: Topic, kept: bool = False) -> None:
         def hear(data: bytes) -> None:
             try:
-                self._inbox.put_nowait((name, type_name, data))
+                self._inbox.put_nowait((topic.name, topic.type, data))
             except queue.Full:
                 self.counts["dropped"] += 1
 
-        node.subscribe(self._topic(name, type_name, 10), hear)
+        node.subscribe(topic, hear, kept)
 
     def _topic(self, name: str, type_name: str, depth: int) -> Topic:
         return Topic(name, type_name, self._messages.hash(type_name), depth)
 
-    def _place_in_map(self) -> tuple[int, list[int], bool]:
-        """The first index that is free, the landmarks there are, and whether a pose has to be told first."""
+    def _place_in_map(self) -> tuple[int, list[int], bool, int]:
+        """The first index that is free, the landmarks there are, whether a pose has to be told first, and the first
+        index that is free of frames of GNSS."""
         columns = self._map.estimate.snapshot().columns
-        space, first = SPACES[self._settings.space], 0
-        for keys, _ in columns.values():
-            mine = keys[(keys >> 56) == ord(self._settings.letter)]
-            first = max([first, *(mine - symbol(self._settings.letter, 0) + 1).tolist()])
-        landmarks = columns[space.point][0].tolist() if space.point in columns else []
-        return first, landmarks, self._settings.start == "pose" or any(len(keys) for keys, _ in columns.values())
+        landmarks = columns.get(SPACES[self._settings.space].point, ([],))[0]
+        waits = self._settings.start == "pose" or any(len(keys) for keys, _ in columns.values())
+        first, frame = (_first_free(columns, letter) for letter in (self._settings.letter, FRAME_LETTER))
+        return first, list(map(int, landmarks)), waits, frame
 
     def _why_wait(self) -> str:
         return (
@@ -124,11 +124,10 @@ class Bridge:
             self._correct()  # a step brings one by itself
 
     def _draft(self, topic: str, type_name: str, message: Any) -> Draft | None:
-        if type_name == ODOMETRY:
-            return self._front_end.odometry(message)
-        if type_name == POSE:
-            return self._front_end.pose(topic, message)
-        return self._front_end.detections(topic, message)
+        if type_name == TRANSFORMS:
+            self._front_end.static(topic, message)
+            return None
+        return self._front_end.take(topic, type_name, message)
 
     def _say_what_was_done(self) -> None:
         """With messages that waited and could not be used, and with covariances that were taken otherwise."""
@@ -136,7 +135,7 @@ class Bridge:
             self._tell(bad, str(bad.detail["topic"]))
         for topic, remark in self._front_end.remarks:
             self.counts["remarks"] += 1
-            if (topic, remark) not in self._remarked:
+            if (topic, remark) not in self._remarked and len(self._remarked) < _REMARKS:
                 self._remarked.add((topic, remark))
                 log.warning("%s: %s (said once)", topic, remark)
         self._front_end.refused.clear()
@@ -218,3 +217,12 @@ class Bridge:
         self._told[problem.code, topic] += 1
         if (count := self._told[problem.code, topic]) % 100 == 1:
             log.warning("%s [%s] (%d so far)", problem.message, problem.code, count)
+
+
+def _first_free(columns: Mapping[str, Any], letter: str) -> int:
+    """The index after the last key of a letter."""
+    first = 0
+    for keys, _ in columns.values():
+        mine = keys[(keys >> 56) == ord(letter)]
+        first = max([first, *(mine - symbol(letter, 0) + 1).tolist()])
+    return first

@@ -18,7 +18,7 @@ from factorbus.ros2.problems import BadRosMessage
 
 _ROUNDING = 1e-6
 # From this variance on an axis is not known, and what is taken then: σ in metres and radians.
-_UNKNOWN = 1e12
+UNKNOWN = 1e12
 _UNKNOWN_M, _UNKNOWN_RAD = 1e3, math.pi
 _UNKNOWN_VARIANCE = np.array([_UNKNOWN_M**2] * 3 + [_UNKNOWN_RAD**2] * 3)
 # Of an information matrix without units, smallest eigenvalue by largest: a map takes 1e-14.
@@ -52,7 +52,7 @@ class Checked:
             return ""
         axes = ", ".join(_AXES[axis] for axis in self.unknown)
         return (
-            f"a covariance with a variance of {_UNKNOWN:g} or more in {axes}; taken as not known: "
+            f"a covariance with a variance of {UNKNOWN:g} or more in {axes}; taken as not known: "
             f"a standard deviation of {_UNKNOWN_M:g} m or {_UNKNOWN_RAD:.2f} rad"
         )
 
@@ -62,11 +62,11 @@ def checked_covariance(topic: str, numbers: F64, axes: tuple[int, ...]) -> Check
     whole = np.asarray(numbers, np.float64).reshape(6, 6)
     if not np.isfinite(whole[np.ix_(axes, axes)]).all():
         raise BadRosMessage(topic, "a covariance that is not finite", "finite numbers")
-    unknown = tuple(axis for axis in axes if whole[axis, axis] >= _UNKNOWN)
+    unknown = tuple(axis for axis in axes if whole[axis, axis] >= UNKNOWN)
     axes = tuple(axis for axis in axes if axis not in unknown)
     part = whole[np.ix_(axes, axes)]
     size = float(np.abs(part).max(initial=0.0))
-    if size >= _UNKNOWN:
+    if size >= UNKNOWN:
         raise BadRosMessage(topic, f"a covariance with {size:.3g} off its diagonal", "less than its variances allow")
     if float(np.abs(part - part.T).max(initial=0.0)) > _ROUNDING * size:
         raise BadRosMessage(topic, "a covariance that is not symmetric", "a symmetric matrix")

@@ -8,7 +8,7 @@ from factorbus.client import Snapshot
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.geometry import Transform, quaternion
 from factorbus.ros2.messages import LATEST_S, Messages
-from factorbus.ros2.settings import Settings
+from factorbus.ros2.settings import FRAME_LETTER, Settings
 from factorbus.ros2.space import SPACES
 
 _SPHERES, _POINTS = 7, 8  # Marker.SPHERE_LIST, Marker.POINTS
@@ -36,7 +36,7 @@ def path(messages: Messages, settings: Settings, snapshot: Snapshot, stamp_ns: i
 
 
 def markers(messages: Messages, settings: Settings, snapshot: Snapshot, stamp_ns: int) -> bytes:
-    """All landmarks as spheres and all poses as points, each one marker, as CDR."""
+    """All landmarks as spheres and all poses of robots as points, each one marker, as CDR."""
     space = SPACES[settings.space]
     made = [
         _marker(messages, settings, stamp_ns, "landmarks", _SPHERES, _LANDMARK_M, (0.9, 0.6, 0.0), places)
@@ -75,7 +75,10 @@ def pose(messages: Messages, T: Transform) -> Any:
 
 
 def _places(snapshot: Snapshot, kind: str, flat: bool) -> list[list[float]]:
-    _, rows = snapshot.columns.get(kind, (None, np.empty((0, 3))))
+    """Of the variables of a kind; GNSS's frames are poses, but no places in the map."""
+    keys, rows = snapshot.columns.get(kind, (np.empty(0, np.int64), np.empty((0, 3))))
+    if not kind.startswith("point"):
+        rows = rows[keys >> 56 != ord(FRAME_LETTER)]
     size = 2 if flat else 3
     return [[*row, 0.0][:3] for row in rows[:, :size].tolist()]
 

@@ -1,31 +1,39 @@
 """From what a robot says to what goes into the map.  No bus and no clock: messages in, drafts out.
 
-Odometry makes keyframes, which have its time stamp, and the factors between them.  A pose or an observation belongs to
-the last keyframe before it: it is carried there by odometry, and what that adds to its covariance is added.  What is
-stamped later than the last odometry waits for the next.
+Odometry makes keyframes, which have its time stamp, and the factors between them.  A pose, an observation or a fix of
+GNSS belongs to the last keyframe before it: it is carried there by odometry, and what that adds to its covariance is
+added.  What is stamped later than the last odometry waits for the next.  Loop closures are of the nodes of a graph,
+which are placed in the same way.
 """
 
-import hashlib
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
 from factorbus.client.draft import Draft
 from factorbus.proto.arrays import F64
-from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
-from factorbus.ros2.certainty import Checked, checked_covariance, floored, information
-from factorbus.ros2.geometry import FARTHEST_M, Transform, carried, from_pose, local
-from factorbus.ros2.messages import LATEST_S, Stamp
+from factorbus.proto.symbols import symbol
+from factorbus.ros2.certainty import information
+from factorbus.ros2.closures import GraphClosures, NodePlace
+from factorbus.ros2.fixes import Antenna, GnssFixes, read_fix
+from factorbus.ros2.geometry import Transform, carried, local
+from factorbus.ros2.graphs import heard_graph
+from factorbus.ros2.message_parts import Notes, stamp_ns_of, transform_of
+from factorbus.ros2.messages import DETECTIONS, FIX, ODOMETRY, POSE
+from factorbus.ros2.mounts import Mounts
+from factorbus.ros2.observations import LandmarkReader, cross_matrix
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
 from factorbus.ros2.track import KeyframePlace, OdometryTrack, Sample
-from factorbus.wording import counted
 
 _WAITING = 256
-_ALL_AXES = (0, 1, 2, 3, 4, 5)
+_STILL = 1e-12  # metres and radians: no way at all
+
+# What uses a message once odometry is there, of (draft, its stamp, its topic, itself).
+_Use = Callable[[Draft, int, str, Any], None]
 
 
 class FrontEnd:
@@ -33,26 +41,37 @@ class FrontEnd:
     (topic, what was done); the bridge empties both.
 
     first: index of the first key.  landmarks: keys that the map has already.  wait_for_pose: begin with a pose.
+    frame: index of the key of GNSS's frame.
     """
 
-    def __init__(self, settings: Settings, first: int, landmarks: Iterable[int], wait_for_pose: bool) -> None:
+    def __init__(
+        self, settings: Settings, first: int, landmarks: Iterable[int], wait_for_pose: bool, frame: int = 0
+    ) -> None:
         self._settings, self._space, self._floors = settings, SPACES[settings.space], settings.floors
-        self._track = OdometryTrack()
-        self._waiting: deque[tuple[int, str, Any]] = deque(maxlen=_WAITING)
-        self.refused: list[BadRosMessage] = []
-        self.remarks: list[tuple[str, str]] = []
+        self._track, self._notes = OdometryTrack(), Notes()
+        self._waiting: deque[tuple[int, str, Any, _Use]] = deque(maxlen=_WAITING)
+        self._mounts = Mounts(settings.mounts)
+        self._observations = LandmarkReader(settings, self._mount, self._notes)
+        self._closures = GraphClosures(settings, self._try_node_place, self._notes)
+        self._fixes = GnssFixes(settings, frame, self._notes)
+        self.refused, self.remarks = self._notes.refused, self._notes.remarks
         self.odometry_frame, self.base_frame = "", ""
-        self.begin_again(first, landmarks, wait_for_pose)
+        self.begin_again(first, landmarks, wait_for_pose, frame)
 
-    def begin_again(self, first: int, landmarks: Iterable[int], wait_for_pose: bool) -> None:
+    def begin_again(self, first: int, landmarks: Iterable[int], wait_for_pose: bool, frame: int = 0) -> None:
         """As new, for a map that is another one."""
         self._next, self._landmarks, self._wait_for_pose = first, set(landmarks), wait_for_pose
+        self._T_map_odom = Transform(np.eye(3), np.zeros(3))
         self._track.forget()
         self._waiting.clear()
+        self._closures.forget()
+        self._fixes.forget(frame)
 
     def rewind(self, present: Callable[[int], bool]) -> None:
         """An insert was refused: go on from the last keyframe that is in the map."""
         self._track.rewind(present)
+        self._closures.rewind(present)
+        self._fixes.rewind(present)
         self._landmarks = {key for key in self._landmarks if present(key)}
 
     @property
@@ -73,6 +92,25 @@ class FrontEnd:
                 return self._space.transform(row) @ keyframe.T_odom_base.inverse()
         return None
 
+    def open_ends(self) -> Iterator[tuple[str, str]]:
+        """(topic, what still waits), for people, where a recording ends."""
+        yield from self._closures.open_ends()
+        yield from ((" and ".join(self._settings.fixes), text) for text in self._fixes.open_ends())
+
+    def take(self, topic: str, type_name: str, message: Any) -> Draft | None:
+        """A message of any type of `Settings.inputs`.  Raises BadRosMessage."""
+        if type_name == ODOMETRY:
+            return self.odometry(message)
+        if type_name == POSE:
+            return self.pose(topic, message)
+        if type_name == DETECTIONS:
+            return self.detections(topic, message)
+        return self.fix(topic, message) if type_name == FIX else self.graph(topic, type_name, message)
+
+    def static(self, topic: str, message: Any) -> None:
+        """A tf2_msgs/TFMessage that says where sensors are.  Raises BadRosMessage: of a part of it."""
+        self._mounts.hear(topic, message)
+
     def odometry(self, message: Any) -> Draft | None:
         """A nav_msgs/Odometry.  Raises BadRosMessage: it is not used."""
         sample = self._sample(message)
@@ -84,6 +122,7 @@ class FrontEnd:
         elif keyframe is not None and self._is_far(sample):
             self._add_keyframe(draft, sample)
         self._use_what_waited(draft)
+        self._closures.advance(draft)
         return None if _is_empty(draft) else draft
 
     def pose(self, topic: str, message: Any) -> Draft | None:
@@ -91,11 +130,21 @@ class FrontEnd:
         frame = message.header.frame_id
         if frame != self._settings.map_frame:
             raise BadRosMessage(topic, f"a pose in frame {frame!r}", f"one in {self._settings.map_frame!r}")
-        return self._take(topic, message)
+        return self._take(topic, message, self._use_pose)
 
     def detections(self, topic: str, message: Any) -> Draft | None:
         """A vision_msgs/Detection3DArray.  Raises BadRosMessage."""
-        return self._take(topic, message) if message.detections else None
+        return self._take(topic, message, self._use_detections) if message.detections else None
+
+    def fix(self, topic: str, message: Any) -> Draft | None:
+        """A sensor_msgs/NavSatFix.  Raises BadRosMessage."""
+        return self._take(topic, message, self._use_fix)
+
+    def graph(self, topic: str, type_name: str, message: Any) -> Draft | None:
+        """A pose_graph_tools_msgs/PoseGraph, rtabmap_msgs/MapGraph or rtabmap_msgs/Link.  Raises BadRosMessage."""
+        draft = Draft()
+        self._closures.hear(topic, heard_graph(topic, type_name, message, self._settings.rotation_first), draft)
+        return None if _is_empty(draft) else draft
 
     def _sample(self, message: Any) -> Sample:
         topic = self._settings.odometry
@@ -104,12 +153,12 @@ class FrontEnd:
             raise BadRosMessage(topic, f"frames {frames}", f"{self.odometry_frame, self.base_frame} as before")
         if not all(frames):
             raise BadRosMessage(topic, f"frames {frames}", "names of both the odometry and the base frame")
-        stamp_ns = self._stamp(topic, message)
+        stamp_ns = stamp_ns_of(topic, message.header.stamp)
         if self._track.latest is not None and stamp_ns <= self.stamp_ns:
             raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", f"one after the last, {self.stamp_ns} ns")
-        T = self._space.fitted(self._transform(topic, message.pose.pose))
-        covariance = self._checked(topic, "pose", message.pose.covariance, self._space.axes)
-        twist = self._checked(topic, "twist", message.twist.covariance, self._space.axes)
+        T = self._space.fitted(transform_of(topic, message.pose.pose))
+        covariance = self._notes.checked(topic, "pose", message.pose.covariance, self._space.axes)
+        twist = self._notes.checked(topic, "twist", message.twist.covariance, self._space.axes)
         self.odometry_frame, self.base_frame = frames
         known, unknown = local(covariance.known, T.R), local(covariance.spread, T.R)
         return self._track.add(stamp_ns, T, known, twist.whole, unknown)
@@ -140,35 +189,33 @@ class FrontEnd:
             max(floors.drift_rad * metres + floors.turn_rad * radians, floors.least_rad),
         )
 
-    def _take(self, topic: str, message: Any) -> Draft | None:
-        stamp_ns = self._stamp(topic, message)
+    def _take(self, topic: str, message: Any, use: _Use) -> Draft | None:
+        stamp_ns = stamp_ns_of(topic, message.header.stamp)
         if self._track.latest is None or stamp_ns > self.stamp_ns:
-            self._waiting.append((stamp_ns, topic, message))
+            self._waiting.append((stamp_ns, topic, message, use))
             return None
         draft = Draft()
-        self._use(draft, stamp_ns, topic, message)
+        self._check_covered(stamp_ns, topic)
+        use(draft, stamp_ns, topic, message)
         return None if _is_empty(draft) else draft
 
     def _use_what_waited(self, draft: Draft) -> None:
         due = [each for each in self._waiting if each[0] <= self.stamp_ns]
         self._waiting = deque((each for each in self._waiting if each[0] > self.stamp_ns), _WAITING)
-        for stamp_ns, topic, message in due:
+        for stamp_ns, topic, message, use in due:
             try:
-                self._use(draft, stamp_ns, topic, message)
+                self._check_covered(stamp_ns, topic)
+                use(draft, stamp_ns, topic, message)
             except BadRosMessage as bad:
                 self.refused.append(bad)
 
-    def _use(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
+    def _check_covered(self, stamp_ns: int, topic: str) -> None:
         if not self._track.covers(stamp_ns):
             raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", "one for which odometry is still remembered")
-        if hasattr(message, "detections"):
-            self._use_detections(draft, stamp_ns, topic, message)
-        else:
-            self._use_pose(draft, stamp_ns, topic, message)
 
     def _use_pose(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
-        T_map_base = self._space.fitted(self._transform(topic, message.pose.pose))
-        covariance = self._checked(topic, "pose", message.pose.covariance, self._space.axes).whole
+        T_map_base = self._space.fitted(transform_of(topic, message.pose.pose))
+        covariance = self._notes.checked(topic, "pose", message.pose.covariance, self._space.axes).whole
         covariance = local(covariance, T_map_base.R)
         covariance = self._space.floored(covariance, self._floors.pose_m, self._floors.pose_rad)
         begins, sample = self.waits_for_pose, self._track.before(stamp_ns)
@@ -179,10 +226,11 @@ class FrontEnd:
             raise BadRosMessage(topic, "a pose from before the first keyframe", "one from after it")
         T_base_keyframe = place.T.inverse()
         T_map_keyframe = T_map_base @ T_base_keyframe
-        if place.T.t.any() or place.T.angle() > 0.0:
+        if _moves(place):
             covariance = carried(covariance, T_base_keyframe) + carried(self._floored_way(place), T_base_keyframe)
         row = self._space.row(T_map_keyframe)
         if begins:
+            self._T_map_odom = T_map_keyframe @ place.keyframe.T_odom_base.inverse()
             draft.variable(self._space.pose, place.keyframe.key, row, stamp=sample.stamp_ns)
         weight = information(self._space.residual(covariance))
         draft.factor(f"prior_{self._space.pose}", (place.keyframe.key,), row, information=weight)
@@ -191,118 +239,62 @@ class FrontEnd:
         place = self._track.try_place(stamp_ns)
         if place is None:
             raise BadRosMessage(topic, "observations from before the first keyframe", "some from after it")
-        way = self._floored_way(place)
-        # All are looked at before one is used: a message is used whole or not at all.
-        seen = [self._observation(topic, message, each, place, way) for each in message.detections]
-        for key, measured, weight in seen:
-            if key not in self._landmarks:
-                self._landmarks.add(key)
-                draft.variable(self._space.point, key)
-            kind = f"landmark_{self._space.pose}"
-            draft.factor(kind, (place.keyframe.key, key), measured, information=weight)
+        for seen in self._observations.read(topic, message, place.T, self._floored_way(place)):
+            if seen.key not in self._landmarks:
+                self._landmarks.add(seen.key)
+                draft.variable(self._space.point, seen.key)
+            keys = place.keyframe.key, seen.key
+            draft.factor(f"landmark_{self._space.pose}", keys, seen.measured, information=seen.information)
 
-    def _observation(self, topic: str, message: Any, seen: Any, place: KeyframePlace, way: F64) -> tuple[int, F64, F64]:
-        """Key of the landmark, where it is from the keyframe, and the information of that.
+    def _use_fix(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
+        fix = read_fix(topic, message, self._settings.fix_sigma_m, self._space.point_axes, self._notes)
+        if fix is None:
+            return
+        place = self._track.try_place(stamp_ns)
+        if place is None:
+            raise BadRosMessage(topic, "a fix from before the first keyframe", "one from after it")
+        at = self._lever(topic, message.header.frame_id)
+        lever = place.T.R @ at + place.T.t
+        T = self._T_map_odom @ place.keyframe.T_odom_base
+        variance = 0.0
+        if _moves(place):
+            J = np.hstack([np.eye(3), -cross_matrix(at)])
+            variance = float(np.linalg.eigvalsh(J @ self._floored_way(place) @ J.T)[-1])
+        antenna = Antenna(place.keyframe.key, lever, T.R @ lever + T.t, variance)
+        self._fixes.use(topic, fix, antenna, draft)
 
-        q = T p', p' = R p + t with T the keyframe's way, (R, t) the mount: Σ_q = R_q Σ_p R_qᵀ + J Σ_T Jᵀ with
-        R_q = R_T R and J = R_T [I, −[p']ₓ].
-        """
-        position, covariance = self._position(topic, seen)
-        mount = self._mount(topic, seen.header.frame_id or message.header.frame_id)
-        p = mount.R @ position + mount.t
-        R = place.T.R @ mount.R
-        J = place.T.R @ np.hstack([np.eye(3), -_cross(p)])
-        axes = list(self._space.point_axes)
-        spread = (R @ covariance @ R.T + J @ way @ J.T)[np.ix_(axes, axes)]
-        weight = information(floored(spread, np.full(len(axes), self._floors.landmark_m)))
-        key = symbol(self._settings.landmark_letter, landmark_index(_identity(topic, seen)))
-        return key, (place.T.R @ p + place.T.t)[axes], weight
+    def _lever(self, topic: str, frame: str) -> F64:
+        """Where the antenna is on the robot; in its middle where nothing says where its frame is."""
+        mount = self._mounts.try_mount(self.base_frame, frame)
+        if mount is None:
+            text = f"nothing says where frame {frame[:80]!r} is: the antenna is taken to be at {self.base_frame[:80]!r}"
+            self._notes.remark(topic, f"{text} (--mount)")
+            return np.zeros(3)
+        return mount.t
 
-    def _position(self, topic: str, seen: Any) -> tuple[F64, F64]:
-        """Where it is in the sensor's frame, (3,), and the covariance of that, (3, 3)."""
-        best = _best(seen)
-        if best is None:
-            where, covariance = seen.bbox.center.position, np.zeros((3, 3))
-        else:
-            where = best.pose.pose.position
-            numbers = _translation_only(best.pose.covariance)
-            covariance = self._checked(topic, "position", numbers, _ALL_AXES).whole[:3, :3]
-        position = np.array([where.x, where.y, where.z], np.float64)
-        if not (np.abs(position) <= FARTHEST_M).all():
-            raise BadRosMessage(topic, f"a position of {position.tolist()}", f"at most {FARTHEST_M:g} m in each axis")
-        return position, covariance
-
-    def _checked(self, topic: str, what: str, numbers: F64, axes: tuple[int, ...]) -> Checked:
-        """A covariance that can be one; what was done with it is noted.  Raises BadRosMessage."""
-        made = checked_covariance(topic, numbers, axes)
-        if made.unknown:
-            self.remarks.append((topic, f"{what}: {made.remark()}"))
-        return made
-
-    def _stamp(self, topic: str, message: Any) -> int:
-        """Of its header, nanoseconds.  Raises BadRosMessage."""
-        stamp = message.header.stamp
-        if not (0 <= stamp.sec <= LATEST_S and 0 <= stamp.nanosec < 1_000_000_000):
-            wanted = f"0 to {LATEST_S} s and less than 10⁹ ns"
-            raise BadRosMessage(topic, f"a stamp of {stamp.sec} s and {stamp.nanosec} ns", wanted)
-        return Stamp.of(stamp).ns
+    def _try_node_place(self, topic: str, stamp_ns: int) -> NodePlace | None:
+        """Where a node of a graph is, as `GraphClosures` wants it."""
+        if self._track.latest is None or stamp_ns > self.stamp_ns:
+            return None
+        self._check_covered(stamp_ns, topic)
+        place = self._track.try_place(stamp_ns)
+        if place is None:
+            raise BadRosMessage(topic, "a node from before the first keyframe", "one from after it")
+        if not _moves(place):
+            return NodePlace(place.keyframe.key, Transform(np.eye(3), np.zeros(3)), None)
+        return NodePlace(place.keyframe.key, place.T, self._floored_way(place))
 
     def _mount(self, topic: str, frame: str) -> Transform:
-        if frame == self.base_frame:
-            return Transform(np.eye(3), np.zeros(3))
-        if frame not in self._settings.mounts:
+        mount = self._mounts.try_mount(self.base_frame, frame)
+        if mount is None:
             wanted = f"{self.base_frame!r}, or where that frame is on the robot: --mount {frame}=x,y,z,qx,qy,qz,qw"
             raise BadRosMessage(topic, f"observations in frame {frame!r}", wanted)
-        return self._settings.mounts[frame]
-
-    def _transform(self, topic: str, pose: Any) -> Transform:
-        try:
-            return from_pose(pose)
-        except ValueError as error:
-            wanted = f"numbers up to {FARTHEST_M:g} m and a unit quaternion"
-            raise BadRosMessage(topic, str(error), wanted) from None
+        return mount
 
 
-def landmark_index(identity: str) -> int:
-    """The index of a landmark's key: its identity where that is a number, else 56 bits of BLAKE2b of it."""
-    if identity.isascii() and identity.isdigit() and int(identity) <= MAX_INDEX:
-        return int(identity)
-    return int.from_bytes(hashlib.blake2b(identity.encode(), digest_size=7).digest(), "big")
-
-
-def describe(draft: Draft) -> str:
-    """What is in it, for a log."""
-    keys = [format_symbol(key) for group in draft.batch().variables for key in group.keys.tolist()]
-    return f"new {', '.join(keys) or 'nothing'}, {counted(draft.batch().factor_count, 'factor')}"
-
-
-def _identity(topic: str, seen: Any) -> str:
-    """The detection's own id, else the class of its best hypothesis (a tag's number, usually)."""
-    best = _best(seen)
-    identity = getattr(seen, "id", "") or (_class_of(best) if best is not None else "")
-    if not identity:
-        raise BadRosMessage(topic, "a detection without id or class", "one that says which landmark it is")
-    return identity
-
-
-def _translation_only(numbers: F64) -> F64:
-    made = np.zeros((6, 6))
-    made[:3, :3] = np.asarray(numbers, np.float64).reshape(6, 6)[:3, :3]
-    return made
-
-
-def _best(seen: Any) -> Any:
-    return max(seen.results, key=lambda each: getattr(each, "hypothesis", each).score, default=None)
-
-
-def _class_of(result: Any) -> str:
-    """Of a hypothesis, which in ROS 1 has a number."""
-    return str(result.hypothesis.class_id if hasattr(result, "hypothesis") else result.id)
-
-
-def _cross(p: F64) -> F64:
-    x, y, z = p.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def _moves(place: KeyframePlace) -> bool:
+    """The robot is not where the keyframe is."""
+    return float(np.abs(place.T.t).max()) > _STILL or place.T.angle() > _STILL
 
 
 def _is_empty(draft: Draft) -> bool:

@@ -2,7 +2,8 @@
 
 Landmarks come as vision_msgs/Detection3DArray: of the messages in common use it is the one that has for each
 observation an identity, a position in metres and a covariance (AprilTag's own message has corners in pixels; markers
-are for drawing).  It is in no type store, so its definition stands here, as it is since ROS 2 Humble.
+are for drawing).  Loop closures come as front ends publish their graphs: pose_graph_tools_msgs/PoseGraph (Kimera),
+rtabmap_msgs/MapGraph and Link.  These are in no type store, so their definitions stand here, as they are for ROS 2.
 """
 
 import struct
@@ -20,6 +21,17 @@ POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DETECTIONS = "vision_msgs/msg/Detection3DArray"
 PATH = "nav_msgs/msg/Path"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+FIX = "sensor_msgs/msg/NavSatFix"
+IMU = "sensor_msgs/msg/Imu"
+POSE_GRAPH = "pose_graph_tools_msgs/msg/PoseGraph"
+MAP_GRAPH = "rtabmap_msgs/msg/MapGraph"
+LINK = "rtabmap_msgs/msg/Link"
+# The same messages of ROS 1, where their packages had other names; their definitions come with the recordings.
+FORMER_NAMES = {
+    "pose_graph_tools/msg/PoseGraph": POSE_GRAPH,
+    "rtabmap_ros/msg/MapGraph": MAP_GRAPH,
+    "rtabmap_ros/msg/Link": LINK,
+}
 MARKERS = "visualization_msgs/msg/MarkerArray"
 
 # The last second that a stamp may have: time in messages is a signed 32-bit count, and transforms are stamped ahead.
@@ -46,6 +58,25 @@ _VISION = {
     ),
     DETECTIONS: "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
 }
+_GRAPHS = {
+    "pose_graph_tools_msgs/msg/PoseGraphNode": (
+        "std_msgs/Header header\nint32 robot_id\nuint64 key\ngeometry_msgs/Pose pose"
+    ),
+    "pose_graph_tools_msgs/msg/PoseGraphEdge": (
+        "std_msgs/Header header\nuint64 key_from\nuint64 key_to\nint32 robot_from\nint32 robot_to\nint32 type\n"
+        "int32 ODOM=0\nint32 LOOPCLOSE=1\nint32 LANDMARK=2\nint32 REJECTED_LOOPCLOSE=3\nint32 MESH=4\n"
+        "int32 POSE_MESH=5\nint32 MESH_POSE=6\ngeometry_msgs/Pose pose\nfloat64[36] covariance"
+    ),
+    POSE_GRAPH: (
+        "std_msgs/Header header\npose_graph_tools_msgs/PoseGraphNode[] nodes\n"
+        "pose_graph_tools_msgs/PoseGraphEdge[] edges"
+    ),
+    LINK: "int32 from_id\nint32 to_id\nint32 type\ngeometry_msgs/Transform transform\nfloat64[36] information",
+    MAP_GRAPH: (
+        "std_msgs/Header header\ngeometry_msgs/Transform map_to_odom\nint32[] poses_id\n"
+        "geometry_msgs/Pose[] poses\nrtabmap_msgs/Link[] links"
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +91,9 @@ class Stamp:
         return cls(message.sec * 1_000_000_000 + message.nanosec)
 
 
-def register_detections(store: Any) -> None:
-    """Add what landmarks come as to a type store."""
-    for name, text in _VISION.items():
+def register_further_types(store: Any) -> None:
+    """Add what landmarks and loop closures come as to a type store."""
+    for name, text in {**_VISION, **_GRAPHS}.items():
         store.register(get_types_from_msg(text, name))
 
 
@@ -72,7 +103,7 @@ class Messages:
     def __init__(self, distribution: str) -> None:
         self._store = get_typestore(DISTRIBUTIONS[distribution])
         self._hashed = distribution != "humble"
-        register_detections(self._store)
+        register_further_types(self._store)
 
     def hash(self, type_name: str) -> str:
         """RIHS01_ and the SHA-256 of the type's description (REP 2016), or what stands for it."""

@@ -48,9 +48,12 @@ class NodeName:
         """Alive while the node is: what `ros2 node list` goes by."""
         return self._place(0, "NN")
 
-    def endpoint_token(self, number: int, kind: str, topic: Topic) -> str:
-        """Alive while the endpoint is: what `ros2 topic list` goes by.  kind: MP publishes, MS subscribes."""
-        words = (_mangled(topic.name), dds_type(topic.type), topic.hash, quality(topic.depth))
+    def endpoint_token(self, number: int, kind: str, topic: Topic, kept: bool = False) -> str:
+        """Alive while the endpoint is: what `ros2 topic list` goes by.  kind: MP publishes, MS subscribes.
+
+        kept: with what was published before (transient local).
+        """
+        words = (_mangled(topic.name), dds_type(topic.type), topic.hash, quality(topic.depth, kept))
         return "/".join((self._place(number, kind), *words))
 
     def _place(self, number: int, kind: str) -> str:
@@ -66,9 +69,9 @@ def dds_type(type_name: str) -> str:
     return f"{package}::{folder}::dds_::{name}_"
 
 
-def quality(depth: int) -> str:
-    """Reliable, volatile, the last `depth`: everything that is as rmw_zenoh's default is left out."""
-    return f"::,{depth}:,:,:,,"
+def quality(depth: int, kept: bool = False) -> str:
+    """Reliable, volatile, or transient local where `kept`, the last `depth`: what is as by default is left out."""
+    return f":{1 if kept else ''}:,{depth}:,:,:,,"
 
 
 def gid(token: str) -> bytes:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import zenoh
+from zenoh.ext import HistoryConfig, declare_advanced_subscriber
 from zenoh.handlers import Callback
 
 from factorbus.client.link import open_session
@@ -35,15 +36,22 @@ class Node:
         self._declared.append(made)
         return Publisher(made, gid(self._announce("MP", topic)))
 
-    def subscribe(self, topic: Topic, hear: Callable[[bytes], None]) -> None:
-        """From now on every message on a topic goes to `hear`, on Zenoh's thread: it may only hand over."""
+    def subscribe(self, topic: Topic, hear: Callable[[bytes], None], kept: bool = False) -> None:
+        """From now on every message on a topic goes to `hear`, on Zenoh's thread: it may only hand over.
+
+        kept: and those that its publishers have kept for who comes late (transient local).
+        """
 
         def on_sample(sample: zenoh.Sample) -> None:
             hear(sample.payload.to_bytes())
 
-        key = topic.key(self._domain)
-        self._declared.append(self._session.declare_subscriber(key, Callback(on_sample, indirect=False)))
-        self._announce("MS", topic)
+        key, handler = topic.key(self._domain), Callback(on_sample, indirect=False)
+        if kept:
+            history = HistoryConfig(detect_late_publishers=True, max_samples=topic.depth)
+            self._declared.append(declare_advanced_subscriber(self._session, key, handler, history=history))
+        else:
+            self._declared.append(self._session.declare_subscriber(key, handler))
+        self._announce("MS", topic, kept)
 
     def close(self) -> None:
         """Leave: tokens first, so that nobody counts on what is going."""
@@ -52,8 +60,8 @@ class Node:
         self._tokens, self._declared = [], []
         self._session.close()
 
-    def _announce(self, kind: str, topic: Topic) -> str:
-        token = self._name.endpoint_token(len(self._tokens), kind, topic)
+    def _announce(self, kind: str, topic: Topic, kept: bool = False) -> str:
+        token = self._name.endpoint_token(len(self._tokens), kind, topic, kept)
         self._tokens.append(self._session.liveliness().declare_token(token))
         return token
 

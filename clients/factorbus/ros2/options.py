@@ -10,6 +10,7 @@ class RobotOptions:
 
     odom, poses, landmarks: topics.  space: poses in space.  keyframe: metres, radians.
     mounts: FRAME=x,y,z,qx,qy,qz,qw.  drift: per metre, per radian.
+    pose_graphs, map_graphs, links, fixes: topics.  fix_sigma: metres.  robot_id: in pose graphs; None: the first.
     """
 
     odom: str
@@ -22,6 +23,13 @@ class RobotOptions:
     keyframe: tuple[float, float]
     mounts: Sequence[str]
     drift: tuple[float, float]
+    pose_graphs: Sequence[str] = ()
+    map_graphs: Sequence[str] = ()
+    links: Sequence[str] = ()
+    fixes: Sequence[str] = ()
+    fix_sigma: float = 5.0
+    robot_id: int | None = None
+    rotation_first: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,8 +12,29 @@ class BadRosMessage(Problem):
 
     def __init__(self, topic: str, found: str, wanted: str) -> None:
         super().__init__(
-            f"{topic}: {found}; wanted {wanted}; the message is not used", topic=topic, seen=found, wanted=wanted
+            f"{topic}: {found}; wanted {wanted}; {self._whole} is not used", topic=topic, seen=found, wanted=wanted
         )
+
+    _whole = "the message"
+
+    @property
+    def of_message(self) -> bool:
+        """It is the whole message that is not used, and not a part of it."""
+        return True
+
+
+class BadRosEdge(BadRosMessage):
+    """An edge or a node of a graph that is not used; the rest of the message is."""
+
+    _whole = "it"
+
+    def __init__(self, topic: str, part: str, found: str, wanted: str) -> None:
+        super().__init__(topic, f"{part}: {found}", wanted)
+
+    @property
+    def of_message(self) -> bool:
+        """The rest of the message is used."""
+        return False
 
 
 class Unusable(Problem):

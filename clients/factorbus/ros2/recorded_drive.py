@@ -6,18 +6,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from factorbus.proto.messages import Batch
+from factorbus.proto.roles import poses_aside
 from factorbus.ros2.front_end import FrontEnd
-from factorbus.ros2.geometry import Transform, from_quaternion
-from factorbus.ros2.messages import DETECTIONS, ODOMETRY, POSE, TRANSFORMS
+from factorbus.ros2.messages import (
+    DETECTIONS,
+    FIX,
+    FORMER_NAMES,
+    IMU,
+    LINK,
+    MAP_GRAPH,
+    ODOMETRY,
+    POSE,
+    POSE_GRAPH,
+    TRANSFORMS,
+)  # fmt: skip
 from factorbus.ros2.problems import BadRecording, BadRosMessage
-from factorbus.ros2.recording import RecordedTopic, RobotRecording
-from factorbus.ros2.settings import Settings
+from factorbus.ros2.recording import Recorded, RecordedTopic, RobotRecording
+from factorbus.ros2.settings import STATIC, Settings
 from factorbus.wording import counted
 
-_STATIC = "/tf_static"
 _SHOWN = 8  # topics in a message
 
 
@@ -30,8 +38,9 @@ class RecordedSteps(list[Batch]):
 
     @property
     def poses(self) -> int:
-        """Number of poses in all of them."""
-        return sum(len(group.keys) for batch in self for group in batch.variables if group.kind in ("se2", "se3"))
+        """Number of poses in all of them; GNSS's frame is none."""
+        found = (len(group.keys) for batch in self for group in batch.variables if group.kind in ("se2", "se3"))
+        return sum(found) - len({key for batch in self for key in poses_aside(batch).tolist()})
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +73,6 @@ def read_recording(path: Path, settings: Settings, strict: bool = False) -> Reco
     """
     with RobotRecording(path) as recording:
         settings, notes = _with_topics(recording, settings)
-        settings = replace(settings, mounts={**_mounts(recording, settings), **settings.mounts})
         made = _Reading(recording, settings)
         made.read()
         notes += [*recording.notes, *made.notes()]
@@ -79,38 +87,24 @@ class _Reading:
     """Message after message through a front end."""
 
     def __init__(self, recording: RobotRecording, settings: Settings) -> None:
-        self._recording, self._settings = recording, settings
+        self._recording, self._inputs = recording, settings.inputs()
         self._front_end = FrontEnd(settings, 0, (), settings.start == "pose")
         self.steps, self.used, self.left_out = RecordedSteps(), Counter[str](), Counter[str]()
         self._why: dict[str, str] = {}
         self._remarks: dict[tuple[str, str], int] = {}
 
     def read(self) -> None:
-        """All of it."""
-        settings, front_end = self._settings, self._front_end
-        for message in self._recording.messages([settings.odometry, *settings.poses, *settings.landmarks]):
-            try:
-                try:
-                    read = self._recording.read(message)
-                except Exception as fault:  # whatever the bytes lead to
-                    found = f"{counted(len(message.data), 'byte')} that cannot be read ({fault})"
-                    raise BadRosMessage(message.topic, found, f"a {message.type_name}") from None
-                draft = self._take(message.topic, read)
-            except BadRosMessage as bad:
-                self._leave_out(bad, message.topic)
-            else:
-                self.used[message.topic] += 1
-                if draft is not None:
-                    self.steps.append(draft.batch())
-                    self.steps.times_ns.append(front_end.stamp_ns)
-            for bad in front_end.refused:
-                topic = str(bad.detail["topic"])
-                self.used[topic] -= 1
-                self._leave_out(bad, topic)
-            for remark in front_end.remarks:
-                self._remarks[remark] = self._remarks.get(remark, 0) + 1
-            front_end.refused.clear()
-            front_end.remarks.clear()
+        """All of it; where sensors are comes first, whenever it was said."""
+        statics = [
+            topic.name for topic in self._recording.topics if (topic.name, topic.type_name) == (STATIC, TRANSFORMS)
+        ]
+        for message in self._recording.messages(statics) if statics else ():
+            self._hear(message)
+        for message in self._recording.messages(list(self._inputs)):
+            if (draft := self._hear(message)) is not None:
+                self.steps.append(draft.batch())
+                self.steps.times_ns.append(self._front_end.stamp_ns)
+            self._note()
 
     def notes(self) -> list[str]:
         """What was not used and why, and what was taken otherwise than it came."""
@@ -118,14 +112,40 @@ class _Reading:
             f"{topic}: {counted(count, 'message')} not used; the first: {self._why[topic]}"
             for topic, count in self.left_out.items()
         ]
-        return left + [f"{topic}: {remark} ({counted(n, 'time')})" for (topic, remark), n in self._remarks.items()]
+        left += [f"{topic}: {remark} ({counted(n, 'time')})" for (topic, remark), n in self._remarks.items()]
+        return left + [f"{topic}: {text}" for topic, text in self._front_end.open_ends()]
 
-    def _take(self, topic: str, read: Any) -> Any:
-        if topic == self._settings.odometry:
-            return self._front_end.odometry(read)
-        if topic in self._settings.poses:
-            return self._front_end.pose(topic, read)
-        return self._front_end.detections(topic, read)
+    def _hear(self, message: Recorded) -> Any:
+        """The draft that comes of a message, if one does."""
+        topic = message.topic
+        try:
+            try:
+                read = self._recording.read(message)
+            except Exception as fault:  # whatever the bytes lead to
+                found = f"{counted(len(message.data), 'byte')} that cannot be read ({fault})"
+                raise BadRosMessage(topic, found, f"a {message.type_name}") from None
+            if topic == STATIC:
+                self._front_end.static(topic, read)
+                return None
+            draft = self._front_end.take(topic, self._inputs[topic], read)
+        except BadRosMessage as bad:
+            self._leave_out(bad, topic)
+            return None
+        self.used[topic] += 1
+        return draft
+
+    def _note(self) -> None:
+        """What the front end has said since."""
+        front_end = self._front_end
+        for bad in front_end.refused:
+            topic = str(bad.detail["topic"])
+            if bad.of_message:
+                self.used[topic] -= 1
+            self._leave_out(bad, topic if bad.of_message else f"{topic} (edges)")
+        for remark in front_end.remarks:
+            self._remarks[remark] = self._remarks.get(remark, 0) + 1
+        front_end.refused.clear()
+        front_end.remarks.clear()
 
     def _leave_out(self, bad: BadRosMessage, topic: str) -> None:
         self.left_out[topic] += 1
@@ -135,10 +155,12 @@ class _Reading:
 def _with_topics(recording: RobotRecording, settings: Settings) -> tuple[Settings, list[str]]:
     """The topics to read, those not named by their types, and what was chosen.  Raises BadRecording."""
     topics = {topic.name: topic for topic in recording.topics}
-    named = [*([settings.odometry] if settings.odometry else []), *settings.poses, *settings.landmarks]
-    for name in named:
+    for name, type_name in settings.inputs().items():
         if name not in topics:
             raise BadRecording(recording.path, f"no topic {name}", f"one of {_listed(recording.topics)}")
+        if _type_of(topics[name]) != type_name:
+            found = f"topic {name} of {topics[name].type_name}"
+            raise BadRecording(recording.path, found, f"one of {type_name}")
     notes = []
     if not settings.odometry:
         settings, note = _with_odometry(recording, settings)
@@ -146,9 +168,29 @@ def _with_topics(recording: RobotRecording, settings: Settings) -> tuple[Setting
     if not settings.landmarks and (found := _of_type(recording, DETECTIONS)):
         settings = replace(settings, landmarks=tuple(topic.name for topic in found))
         notes.append(f"landmarks: {_listed(found)}")
+    settings, more = _with_graphs_and_fixes(recording, settings)
+    notes += more
     if not settings.poses and (found := _of_type(recording, POSE)):
         takes = " ".join(f"--pose {topic.name}" for topic in found)
         notes.append(f"poses left out: {_listed(found)}; {takes} takes them, and --start pose begins with the first")
+    if found := _of_type(recording, IMU):
+        notes.append(f"left out, as there is no factor of it from ROS: {_listed(found)} ({IMU})")
+    return settings, notes
+
+
+def _with_graphs_and_fixes(recording: RobotRecording, settings: Settings) -> tuple[Settings, list[str]]:
+    """With all graphs of a front end that are not named, and one receiver of GNSS."""
+    notes = []
+    for name, type_name in (("pose_graphs", POSE_GRAPH), ("map_graphs", MAP_GRAPH), ("links", LINK)):
+        if not getattr(settings, name) and (found := _of_type(recording, type_name)):
+            settings = replace(settings, **{name: tuple(topic.name for topic in found)})
+            notes.append(f"closures: {_listed(found)} ({type_name})")
+    if not settings.fixes and (found := _of_type(recording, FIX)):
+        # What a filter publishes in the form of a fix was made of odometry, too.
+        best = max(found, key=lambda topic: (topic.name.endswith("fix"), "filtered" not in topic.name, topic.count))
+        others = f" (of {_listed(found)}; --fix decides)" if len(found) > 1 else ""
+        settings = replace(settings, fixes=(best.name,))
+        notes.append(f"GNSS: {best.name}{others}")
     return settings, notes
 
 
@@ -164,53 +206,14 @@ def _with_odometry(recording: RobotRecording, settings: Settings) -> tuple[Setti
 
 
 def _of_type(recording: RobotRecording, type_name: str) -> list[RecordedTopic]:
-    return [topic for topic in recording.topics if topic.type_name == type_name]
+    return [topic for topic in recording.topics if _type_of(topic) == type_name]
+
+
+def _type_of(topic: RecordedTopic) -> str:
+    """Its type by the present name."""
+    return FORMER_NAMES.get(topic.type_name, topic.type_name)
 
 
 def _listed(topics: Sequence[RecordedTopic]) -> str:
     more = f" and {len(topics) - _SHOWN} more" if len(topics) > _SHOWN else ""
     return ", ".join(topic.name for topic in topics[:_SHOWN]) + more
-
-
-def _mounts(recording: RobotRecording, settings: Settings) -> dict[str, Transform]:
-    """T_base_frame of all frames that /tf_static joins to the base frame of odometry."""
-    edges: dict[str, dict[str, Transform]] = {}
-    statics = [topic.name for topic in recording.topics if topic.name == _STATIC and topic.type_name == TRANSFORMS]
-    for message in recording.messages(statics) if statics else ():
-        try:
-            transforms = recording.read(message).transforms
-        except Exception:  # whatever the bytes lead to: without them a mount has to be given
-            continue
-        for each in transforms:
-            if (there := _transform(each.transform)) is not None:
-                parent, child = each.header.frame_id, each.child_frame_id
-                edges.setdefault(parent, {})[child] = there
-                edges.setdefault(child, {})[parent] = there.inverse()
-    base = _base_frame(recording, settings)
-    found, ahead = {base: Transform(np.eye(3), np.zeros(3))}, [base]
-    while ahead:
-        frame = ahead.pop()
-        for other, there in edges.get(frame, {}).items():
-            if other not in found:
-                found[other] = found[frame] @ there
-                ahead.append(other)
-    return found
-
-
-def _base_frame(recording: RobotRecording, settings: Settings) -> str:
-    """The frame that odometry is of, by its first message."""
-    for message in recording.messages([settings.odometry]):
-        try:
-            return str(recording.read(message).child_frame_id)
-        except Exception:  # whatever the bytes lead to
-            continue
-    return ""
-
-
-def _transform(transform: Any) -> Transform | None:
-    """None: no turn that can be."""
-    t, q = transform.translation, transform.rotation
-    try:
-        return from_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
-    except ValueError:
-        return None

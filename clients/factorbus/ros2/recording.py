@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from factorbus.ros2.messages import DISTRIBUTIONS, register_detections
+from factorbus.ros2.messages import DISTRIBUTIONS, register_further_types
 from factorbus.ros2.problems import BadRecording
 from factorbus.wording import counted
 
@@ -140,7 +140,7 @@ class _Whole:
 
     def __init__(self, path: Path, stack: ExitStack) -> None:
         store = get_typestore(_LATEST)
-        register_detections(store)
+        register_further_types(store)
         self._reader = stack.enter_context(AnyReader([path], default_typestore=store))
         self.topics = [
             RecordedTopic(name, info.msgtype or "", info.msgcount)

@@ -5,10 +5,13 @@ from dataclasses import dataclass, field, replace
 
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.geometry import Transform, from_quaternion
+from factorbus.ros2.messages import DETECTIONS, FIX, LINK, MAP_GRAPH, ODOMETRY, POSE, POSE_GRAPH
 from factorbus.ros2.options import BridgeOptions, RobotOptions
 from factorbus.ros2.problems import BadRosName
 
 USUAL_POSES, USUAL_LANDMARKS = ("/initialpose",), ("/detections",)
+# Of the key of the map's pose in the frame of GNSS, and the topic of the frames of sensors.
+FRAME_LETTER, STATIC = "f", "/tf_static"
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +19,8 @@ class Floors:
     """Standard deviations below which no measurement counts; see `certainty`.
 
     Of odometry between keyframes: `drift_m` metres and `drift_rad` radians per metre driven, `turn_rad` radians per
-    radian turned, and never less than `least_m`, `least_rad`.  Poses: `pose_m`, `pose_rad`, landmarks: `landmark_m`.
+    radian turned, and never less than `least_m`, `least_rad`.  Poses: `pose_m`, `pose_rad`, landmarks: `landmark_m`,
+    closures: `closure_m`, `closure_rad`, fixes of GNSS: `fix_m`.
     """
 
     drift_m: float = 0.02
@@ -27,6 +31,9 @@ class Floors:
     pose_m: float = 0.01
     pose_rad: float = 0.01
     landmark_m: float = 0.01
+    closure_m: float = 0.05
+    closure_rad: float = 0.02
+    fix_m: float = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +42,18 @@ class Settings:
     start: "odometry": the map begins where odometry does; "pose": with the first pose that is received.
     keyframe_m, keyframe_rad: a keyframe when that far or that much turned since the last.
     mounts: frame of a sensor to T_base_sensor.  tolerance_s: by how much transforms are stamped ahead.
-    display_s: least time between paths.
+    display_s: least time between paths.  fix_sigma_m: of fixes that do not say how good they are.
+    robot_id: which robot of pose graphs this one is; None: the first that is heard.
+    rotation_first: the covariances of pose graphs have rotation before translation, as GTSAM's.
     """
 
     odometry: str = "/odom"
     poses: tuple[str, ...] = USUAL_POSES
     landmarks: tuple[str, ...] = USUAL_LANDMARKS
+    pose_graphs: tuple[str, ...] = ()
+    map_graphs: tuple[str, ...] = ()
+    links: tuple[str, ...] = ()
+    fixes: tuple[str, ...] = ()
     path: str = "/factorbus/path"
     markers: str = "/factorbus/markers"
     transforms: str = "/tf"
@@ -53,8 +66,18 @@ class Settings:
     keyframe_rad: float = 0.35
     tolerance_s: float = 0.1
     display_s: float = 1.0
+    fix_sigma_m: float = 5.0
+    robot_id: int | None = None
+    rotation_first: bool = False
     mounts: Mapping[str, Transform] = field(default_factory=dict)
     floors: Floors = field(default_factory=Floors)
+
+    def inputs(self) -> dict[str, str]:
+        """Topics that are read, odometry first, with the type of each."""
+        odometry = {self.odometry: ODOMETRY} if self.odometry else {}
+        groups = ((self.poses, POSE), (self.landmarks, DETECTIONS), (self.pose_graphs, POSE_GRAPH),
+                  (self.map_graphs, MAP_GRAPH), (self.links, LINK), (self.fixes, FIX))  # fmt: skip
+        return odometry | {name: type_name for names, type_name in groups for name in names}
 
 
 def bridge_settings(options: BridgeOptions) -> Settings:
@@ -76,10 +99,19 @@ def bridge_settings(options: BridgeOptions) -> Settings:
 def robot_settings(options: RobotOptions) -> Settings:
     """Of a robot, with the topics that were given and no others.  Raises BadRosName, BadSymbol."""
     symbol(options.letter, 0)
+    if options.letter == FRAME_LETTER:
+        raise BadRosName("the letter", options.letter, f"another one: {FRAME_LETTER}0 is the frame of GNSS")
     return Settings(
         odometry=options.odom,
         poses=tuple(options.poses),
         landmarks=tuple(options.landmarks),
+        pose_graphs=tuple(options.pose_graphs),
+        map_graphs=tuple(options.map_graphs),
+        links=tuple(options.links),
+        fixes=tuple(options.fixes),
+        fix_sigma_m=options.fix_sigma,
+        robot_id=options.robot_id,
+        rotation_first=options.rotation_first,
         map_frame=options.map_frame,
         space="space" if options.space else "plane",
         letter=options.letter,

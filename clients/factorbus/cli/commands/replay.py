@@ -188,7 +188,7 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
         adopted = None
         if request.settle and request.adopt:
             last, adopted = _adopt(request, target, last)
-        written = _write(request, target, graph)
+        written = _write(request, target, graph, steps)
         truth = graph.log.ground_truth if graph.log else ()
         if request.plot:
             with output_file(request.plot):
@@ -314,8 +314,9 @@ def _stay() -> None:
         wait_until(stop)
 
 
-def _write(request: ReplayRequest, target: Any, source: Any) -> list[Path]:
+def _write(request: ReplayRequest, target: Any, source: Any, steps: Any) -> list[Path]:
     """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
+    from factorbus.cli.driving.places import places_only
     from factorbus.cli.output.console import print_note
     from factorbus.formats import write_graph, write_kitti, write_tum
     from factorbus.proto.messages import Batch
@@ -330,7 +331,7 @@ def _write(request: ReplayRequest, target: Any, source: Any) -> list[Path]:
     for path, write in ((request.tum, write_tum), (request.kitti, write_kitti)):
         if path:
             with output_file(path):
-                robots = write(path, Batch(target.estimate()))
+                robots = write(path, Batch(places_only(target.estimate(), steps)))
             if robots != [path]:
                 print_note(f"{path}: one file for each robot: {', '.join(map(str, robots))}")
             files += robots
@@ -345,9 +346,10 @@ def _truth_of(source: Any, out: Path) -> Any:
 def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any, truth: Any) -> None:
     from factorbus.cli.driving.aligned_truth import aligned_truth
     from factorbus.cli.driving.picture import draw, history_of
+    from factorbus.cli.driving.places import places_only
 
     reports = [step.report for step in driven.steps]
-    estimate = target.estimate()
+    estimate = places_only(target.estimate(), steps)
     history = history_of(reports, target.compared())
     draw(path, steps, estimate, history, title, truth=aligned_truth(truth, estimate))
 

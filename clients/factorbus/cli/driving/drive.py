@@ -13,6 +13,7 @@ import numpy as np
 
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.problems import BetterOptimum
+from factorbus.proto.roles import poses_aside
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,9 +120,10 @@ class Driven:
     def add(self, batch: Batch) -> None:
         """Count `batch`."""
         self.inserts += 1
+        aside = poses_aside(batch)  # mounts, and the map's pose in the frame of GNSS
         for group in batch.variables:
             if group.kind in ("se2", "se3"):
-                self.poses += len(group.keys)
+                self.poses += int((~np.isin(group.keys, aside)).sum())
             elif not group.kind.startswith("vector"):
                 self.landmarks += len(group.keys)
         self.factors += batch.factor_count

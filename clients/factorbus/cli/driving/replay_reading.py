@@ -12,6 +12,12 @@ from factorbus.cli.output.exits import require
 from factorbus.cli.process.reading import read_drive, say
 from factorbus.ros2.options import RobotOptions
 
+# What is given one by one, and collected under the name of several.
+_ONCE = {
+    "poses": "pose", "mounts": "mount", "pose_graphs": "pose_graph", "map_graphs": "map_graph", "links": "link",
+    "fixes": "fix",
+}  # fmt: skip
+
 
 def check_kind(file: Path) -> None:
     """Raises UsageError: an option is of recordings, or of graph files, and FILE is the other."""
@@ -20,7 +26,7 @@ def check_kind(file: Path) -> None:
     recorded = is_recording(file)
     for name in of_graphs if recorded else of_recordings:
         if given(name) is ParameterSource.COMMANDLINE:
-            option = "--" + {"poses": "pose", "mounts": "mount"}.get(name, name).replace("_", "-")
+            option = "--" + _ONCE.get(name, name).replace("_", "-")
             is_of = "graph files, and this is a recording" if recorded else "recordings (.mcap, .bag, rosbag2)"
             raise click.UsageError(f"{option} is of {is_of}")
 

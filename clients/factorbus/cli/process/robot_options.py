@@ -15,6 +15,7 @@ def robot_options(usual: bool) -> Callable[[F], F]:
     odom, poses, landmarks = (
         ("/odom", "/initialpose", "/detections") if usual else ("", "none", "all of that type in the recording")
     )
+    graphs, fixes = ("none", "none") if usual else ("all of that type in the recording", "one of that type, and said")
     of_type = "" if usual else "  [default: found by its type, and said]"
 
     def with_options(command: F) -> F:
@@ -30,6 +31,33 @@ def robot_options(usual: bool) -> Callable[[F], F]:
             click.option(
                 "--landmarks", multiple=True, metavar="TOPIC",
                 help=f"vision_msgs/Detection3DArray, to read.  [default: {landmarks}]",
+            ),
+            click.option(
+                "--pose-graph", "pose_graphs", multiple=True, metavar="TOPIC",
+                help=f"pose_graph_tools_msgs/PoseGraph, whose loop closures to read.  [default: {graphs}]",
+            ),
+            click.option(
+                "--map-graph", "map_graphs", multiple=True, metavar="TOPIC",
+                help=f"rtabmap_msgs/MapGraph, likewise.  [default: {graphs}]",
+            ),
+            click.option(
+                "--link", "links", multiple=True, metavar="TOPIC",
+                help=f"rtabmap_msgs/Link, between nodes of a MapGraph.  [default: {graphs}]",
+            ),
+            click.option(
+                "--fix", "fixes", multiple=True, metavar="TOPIC",
+                help=f"sensor_msgs/NavSatFix, to read.  [default: {fixes}]",
+            ),
+            click.option(
+                "--fix-sigma", type=Number(min=0, min_open=True), default=5.0, show_default=True, metavar="METRES",
+                help="Of fixes whose covariance is of unknown type.",
+            ),
+            click.option(
+                "--robot-id", type=int, metavar="N", help="Of this robot in pose graphs.  [default: of the first node]"
+            ),
+            click.option(
+                "--rotation-first", is_flag=True,
+                help="Covariances of pose graphs have rotation before translation, as GTSAM's.",
             ),
             click.option("--map-frame", default="map", show_default=True, metavar="FRAME", help="Frame of poses."),
             click.option("--space", is_flag=True, help="Poses in space (se3, point3), not in the plane (se2, point2)."),
