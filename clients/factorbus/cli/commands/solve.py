@@ -80,7 +80,7 @@ def _covariance(ctx: click.Context, parameter: click.Parameter, text: str | None
 @reading_options
 @json_option
 def command(request: SolveRequest, as_json: bool) -> int:
-    """Optimise the graph in FILE (any that `factorbus replay` reads, or a data set's name) and be done: no map, no bus.
+    """Optimize the graph in FILE (any that `factorbus replay` reads, or a data set's name) and be done: no map, no bus.
 
     Levenberg-Marquardt with block Cholesky; a variable without a value gets one from its factors. How much memory it
     takes is said before, and a graph that needs more than there is is refused.
@@ -99,12 +99,12 @@ def command(request: SolveRequest, as_json: bool) -> int:
     The exit code is 1 where the search has ended before it had converged.
     """
     require("service", "factorbus solve")
-    from factorbus.cli.driving.solving import run_solve, solve_rows
+    from factorbus.cli.driving.solving import run_solve, solution_rows
     from factorbus.cli.output import console as screen
 
     result = run_solve(request)
     if as_json:
         screen.document(result)
     else:
-        screen.table(solve_rows(result), title=str(request.file))
+        screen.table(solution_rows(result), title=str(request.file))
     return OK if result["converged"] else FAILED

@@ -1,4 +1,4 @@
-"""What `factorbus solve` does: read, choose what counts, optimise, say, write."""
+"""What `factorbus solve` does: read, choose what counts, optimize, say, write."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -92,7 +92,7 @@ def run_solve(request: SolveRequest) -> dict[str, Any]:
     return result | {"seconds": seconds, "written": [str(path) for path in written]}
 
 
-def solve_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+def solution_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     """(what, how it was), for people."""
     starts = ", ".join(f"{name} {chi2:.6g}" for name, chi2 in result["starts"].items())
     rows = [
