@@ -20,6 +20,7 @@ COMMANDS = {
     "serve": ("serve", "Own maps and answer on the bus until stopped."),
     "work": ("work", "Join the bus as a worker and take jobs."),
     "replay": ("replay", "Drive a graph file (g2o, TORO, iSAM, SLAM++, pyfg, JRL) through a map, pose by pose."),
+    "solve": ("solve", "Optimize a whole graph file: no map, no bus."),
     "simulate": ("simulate", "Write a simulated world to a file."),
     "watch": ("watch", "Watch a map live: in Rerun, in a browser, or into a recording."),
     "gateway": ("gateway", "Maps for browsers: a live page, HTTP and WebSocket."),

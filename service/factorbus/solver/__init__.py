@@ -18,11 +18,14 @@ from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
 from factorbus.solver.starts.batch import BatchResult, solve_batch
+from factorbus.solver.starts.search import BatchEvents, BatchSearch
 from factorbus.solver.tuning import Tuning
 from factorbus.solver.warm import warm
 
 __all__ = [
+    "BatchEvents",
     "BatchResult",
+    "BatchSearch",
     "FactorGroup",
     "Group",
     "Options",

@@ -43,7 +43,7 @@ class G2oBatch:
         new = first_values(batch, self._known)
         for key, (kind, value) in new.items():
             self._ids[key] = len(self._ids)
-            vertex = _VERTICES[kind]()
+            vertex = VERTICES[kind]()
             vertex.set_id(self._ids[key])
             vertex.set_fixed(key in fixed)
             vertex.set_estimate_data(value)
@@ -99,9 +99,9 @@ class G2oBatch:
 
     def _add_edges(self, kind: str, keys: list[list[int]], measured: F64, information: F64) -> None:
         for (i, j), z, omega in zip(keys, measured, information, strict=True):
-            if kind not in _EDGES:
+            if kind not in EDGES:
                 raise Failed(f"no edge for {kind} here")
-            edge = _EDGES[kind]()
+            edge = EDGES[kind]()
             edge.set_vertex(0, self._vertices[i][1])
             edge.set_vertex(1, self._vertices[j][1])
             edge.set_measurement_data(z)
@@ -113,5 +113,5 @@ class G2oBatch:
         return np.asarray(self._vertices[key][1].get_estimate_data(), float)
 
 
-_VERTICES = {"se2": g2o.VertexSE2, "se3": g2o.VertexSE3, "point2": g2o.VertexPointXY}
-_EDGES = {"between_se2": g2o.EdgeSE2, "between_se3": g2o.EdgeSE3, "landmark_se2": g2o.EdgeSE2PointXY}
+VERTICES = {"se2": g2o.VertexSE2, "se3": g2o.VertexSE3, "point2": g2o.VertexPointXY}
+EDGES = {"between_se2": g2o.EdgeSE2, "between_se3": g2o.EdgeSE3, "landmark_se2": g2o.EdgeSE2PointXY}

@@ -10,7 +10,7 @@ iSAM2 with Cholesky goes through only so.)
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
 import gtsam
@@ -46,7 +46,7 @@ class Isam2:
         self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._count()
         for key, (kind, value) in first_values(batch, self._known).items():
-            _insert(self._values, kind, key, value)
+            insert_value(self._values, kind, key, value)
             self._kinds.add(kind)
             if kind in ("se2", "se3"):
                 self._last_pose = (kind, key)
@@ -81,12 +81,7 @@ class Isam2:
 
     def values(self) -> Values:
         """Keys in ascending order, as GTSAM keeps them."""
-        keys = np.array(list(self._estimate.keys()), np.int64)
-        letters, found = keys >> 56, {}
-        for kind in self._kinds:
-            extract, letter = _EXTRACT[kind]
-            found[kind] = (keys[letters == letter], extract(self._estimate))
-        return found
+        return read_kinds(self._estimate, self._kinds)
 
     def own_chi2(self) -> float:
         """What GTSAM has for χ²: twice the error of its factors at the estimate."""
@@ -186,6 +181,16 @@ class Isam2Alone:
         return {"nnz_r": int(self._isam.treeNnz()), "strategies": {"update": self._at + 1}, "read_s": self._read_s}
 
 
+def read_kinds(values: Any, kinds: Iterable[str]) -> Values:
+    """Of variables of some kinds, keys in ascending order, as GTSAM keeps them."""
+    keys = np.array(list(values.keys()), np.int64)
+    letters, found = keys >> 56, {}
+    for kind in kinds:
+        extract, letter = _EXTRACT[kind]
+        found[kind] = (keys[letters == letter], extract(values))
+    return found
+
+
 def _made(threshold: float, factorization: str, wildfire: float) -> Any:
     parameters, search = gtsam.ISAM2Params(), gtsam.ISAM2GaussNewtonParams()
     search.setWildfireThreshold(wildfire)
@@ -200,7 +205,8 @@ def _failed(problem: RuntimeError) -> Failed:
     return Failed(" ".join(str(problem).split())[:200] or "RuntimeError without words")
 
 
-def _insert(values: Any, kind: str, key: int, value: F64) -> None:
+def insert_value(values: Any, kind: str, key: int, value: F64) -> None:
+    """Into GTSAM's values, a row as ours are."""
     if kind == "se2":
         values.insert(key, gtsam.Pose2(*value.tolist()))
     elif kind == "se3":

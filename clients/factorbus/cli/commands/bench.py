@@ -13,7 +13,7 @@ from factorbus.cli.process.options import json_option
 
 BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
 LONG = ("every-step", "paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
-ASKED = ("ask", "digest", "calibration", "inertial", "own", "ranges")  # a minute or two; on request
+ASKED = ("ask", "batch", "digest", "calibration", "inertial", "own", "ranges")  # a minute or two; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -31,6 +31,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     ros2       a robot's odometry with its transform back through `factorbus ros2`, against bare Zenoh
     ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
                of 10,000 candidates; --quick
+    batch      whole graphs from file values and from odometry to the optimum, beside GTSAM and g2o: public data sets,
+               worlds of 10,000 and 100,000 poses; ten minutes; --only, --solvers, --seed; --quick: two minutes
     every-step the χ² of every published estimate over the batch optimum's from there, beside iSAM2's: simulated
                drives, data sets, and steps that turn much of a map; an hour; --no-isam2: a quarter of that;
                --seeds, --seed, --only simulated|data|hard|NAME,...

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.cli.driving.drive import Compared, DriveStep
+from factorbus.cli.driving.optimum import as_messages
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.solver import Options, Solver, compile_seconds, solve_batch
@@ -51,7 +52,7 @@ class LocalMap:
         start = time.perf_counter()
         batch = solve_batch(*self._solver.graph())
         seconds, chi2 = time.perf_counter() - start, self._solver.chi2()
-        values = _variables(batch.values)
+        values = as_messages(batch.values)
         return Compared(self._revision, chi2, batch.chi2, "in-process", seconds, batch.start, values, batch.converged)
 
     def adopt(self, found: Compared) -> DriveStep:
@@ -69,13 +70,13 @@ class LocalMap:
 
     def estimate(self) -> tuple[Variables, ...]:
         """A copy of all variables."""
-        return _variables(self._solver.estimate())
+        return as_messages(self._solver.estimate())
 
     def graph(self) -> Batch:
         """A copy of all variables and factors."""
         variables, factors = self._solver.graph()
         return Batch(
-            _variables(variables),
+            as_messages(variables),
             tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale) for g in factors),
         )
 
@@ -111,7 +112,3 @@ def covariances_at(graph: Batch, keys: I64) -> dict[int, F64]:
     found = blocks.of(np.array([place[key] for key in keys.tolist()], np.int64))
     dims = blocks.factored.dims
     return {key: block[: dims[place[key]], : dims[place[key]]] for key, block in zip(keys.tolist(), found, strict=True)}
-
-
-def _variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
-    return tuple(Variables(group.kind, group.keys, group.values, group.fixed, group.stamps) for group in groups)

@@ -86,15 +86,12 @@ def solved(drawn: Drawn, on_file: bool = True) -> Drawn:
     from factorbus.cli.output.starts import optimum_from
 
     require("service", "--solve")
-    from factorbus.solver import solve_batch
+    from factorbus.cli.driving.optimum import optimum_of
 
-    result = solve_batch(drawn.graph.variables, drawn.graph.factors)
-    groups = tuple(
-        Variables(group.kind, group.keys, group.values, group.fixed, group.stamps) for group in result.values
-    )
+    result, graph = optimum_of(drawn.graph)
     found = optimum_from(result.start, on_file, result.converged)
     about = f"χ² {result.chi2:.6g}, {found}, after {counted(result.iterations, 'iteration')}"
-    return replace(drawn, graph=Batch(groups, drawn.graph.factors), about=about)
+    return replace(drawn, graph=graph, about=about)
 
 
 def spread_in(drawn: Drawn, connect: str | None, most: int, zenoh: str = "") -> "Spread":

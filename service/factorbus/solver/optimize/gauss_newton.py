@@ -4,6 +4,7 @@ The problem is a protocol, so the rules that accept and stop can be read, and te
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -102,7 +103,12 @@ class Minimization:
 
 
 def minimize(
-    problem: LeastSquares, chi2: float, damping: float, rule: StoppingRule, have_factor: bool = False
+    problem: LeastSquares,
+    chi2: float,
+    damping: float,
+    rule: StoppingRule,
+    have_factor: bool = False,
+    tell: Callable[[Minimization], None] = lambda _: None,
 ) -> Minimization:
     """Lower χ² from where `problem` stands until `rule` says stop.  At the end χ² is no higher than at the beginning.
 
@@ -114,6 +120,7 @@ def minimize(
     tells what is left: where residuals are large, undamped steps may lead away from the very optimum.
     With `have_factor` the loop begins with a factor that is there, as after an undamped step.  With non-monotone steps
     it begins without `damping`, which counts once they have been taken back.
+    tell: called after every step that was accepted, with what the step was damped by.
     """
     hills = rule.nonmonotone
     result = Minimization(chi2, 0.0 if hills else damping)
@@ -144,6 +151,7 @@ def minimize(
                 made = _go_over_hill(problem, result, reached, hills)
                 hills = hills - made if made else 0
                 if made:
+                    tell(result)
                     continue
                 if damping > 0.0:
                     result.damping = damping
@@ -154,6 +162,7 @@ def minimize(
         problem.accept()
         result.iterations += 1
         gained, result.chi2 = result.chi2 - reached, reached
+        tell(result)
         if not undamped and rule.is_negligible(gained, reached) and _is_optimum(problem, result, rule):
             result.converged = True
             break

@@ -31,7 +31,7 @@ class Elimination:
 
     def factorize(self, graph: FactorGraph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
         """Factorize Λ with its diagonal times 1 + damping; gives −1, or the block column whose pivot failed."""
-        symbolic = self._analysis(graph, blocks, watch)
+        symbolic = self.analyze(graph, blocks, watch)
         if self._options.backend == "cholmod":
             failed = self._cholesky.take(
                 symbolic,
@@ -63,7 +63,8 @@ class Elimination:
             raise ValueError("there is no factor: the pattern has changed since")
         return symbolic, self._cholesky.arena
 
-    def _analysis(self, graph: FactorGraph, blocks: HessianBlocks, watch: Stopwatch) -> Symbolic:
+    def analyze(self, graph: FactorGraph, blocks: HessianBlocks, watch: Stopwatch) -> Symbolic:
+        """Order and analyse Λ, unless that is done."""
         pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
         if self.symbolic is None or pattern != self._pattern:
             dims = graph.dims[: pattern[0]]

@@ -22,6 +22,8 @@ def tied(graph: FactorGraph, space: PoseSpace, relations: Relations, R: F64, t: 
     count, d = int(graph.counts[at.VARIABLES]), space.dim
     kinds = graph.var[:count, at.V_KIND]
     free = np.concatenate([[False], (kinds == space.point) & (graph.var[:count, at.V_COLUMN] >= 0)])
+    if not free.any():
+        return relations
     whole = np.linalg.eigvalsh(relations.t_information)[:, 0] > 1e-9 * np.trace(
         relations.t_information, axis1=1, axis2=2
     )

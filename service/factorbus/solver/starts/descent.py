@@ -3,7 +3,8 @@
 A start that is on its way to where another one is already, or hopelessly above it, is not finished.  MATH §12.6.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,45 +14,54 @@ from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
-from factorbus.solver.optimize.gauss_newton import StoppingRule, minimize
+from factorbus.solver.optimize.gauss_newton import Minimization, StoppingRule, minimize
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
 from factorbus.solver.sparse.elimination import Elimination
-
-VALUES, ODOMETRY, ROTATIONS = "values", "odometry", "rotations"
-# What is there is preferred, then what no order of the factors decides.
-STARTS = (VALUES, ROTATIONS, ODOMETRY)
+from factorbus.solver.starts.search import ROTATIONS, STARTS, BatchEvents, BatchSearch, NoEvents
+from factorbus.solver.tuning import Tuning
 
 _POLISH = 100
-# Tries at a time; of a start at most, and of one that is not the best when another has converged.
-_CHUNK, _MOST, _MOST_OF_OTHERS = 4, 500, 60
+# Without polishing, a search ends where another step would lower χ² by less than this share of it.
+_UNPOLISHED = 1e-11
+# Tries at a time: of the lowest start first, of others; and at most of one that is not the best when another converged.
+_FIRST_CHUNK, _CHUNK, _MOST_OF_OTHERS = 8, 4, 60
 # Two starts are on the way to the same optimum when no value differs by more than this share of how far they reach, or
 # χ² by less than _SAME_CHI2 of it while it falls by less than _SLOW in a chunk.
 _SAME, _SAME_CHI2, _SLOW = 2e-3, 1e-3, 1e-2
 # A start is hopeless if this number of chunks as good as its last one would not bring it below the best; and where two
 # starts have met, one that is this many times above them after its first chunk.
 _PATIENCE, _FAR = 2, 2.0
+# Averaged rotations that began within this of where they ended were nearly the optimum: the convex problem that they
+# solve leaves no room for a better one to a start that begins this many times above their end.
+_TIGHT, _ABOVE = 2.0, 10.0
 # Ends whose χ² differ by less than this share are one: of those, the start that comes first in the list counts.
 _EQUAL = 1e-9
 NOTHING = Options().tuning.chi2_epsilon
+_USUAL, _NOBODY = BatchSearch(), NoEvents()
+# Bytes of a factor while rotations are averaged: what it says in matrices, several times over.
+_AVERAGED_FACTOR = 2000
 
 
 @dataclass(slots=True)
 class Descent:
     """A start, and how far down it has come.
 
-    rate: χ² before its last chunk over χ² after it.  met: another start was on the way to where this one is.
+    began: χ² of the start.  rate: χ² before its last chunk over χ² after it.  left: what another step would take off.
+    met: another start was on the way to where this one is.
     """
 
     start: str
     values: F64
     chi2: float
+    began: float = np.inf
     damping: float = 0.0
     iterations: int = 0
     tries: int = 0
     rate: float = np.inf
+    left: float = np.inf
     converged: bool = False
     ended: bool = False
     met: bool = False
@@ -60,9 +70,15 @@ class Descent:
 class Descents:
     """The problem that all starts have in common.  Raises Underconstrained: nothing joins a variable to the map."""
 
-    def __init__(self, graph: FactorGraph) -> None:
-        options = Options(mode="all-batch")
-        self._rule = options.tuning.converge_tolerance, 1e-8 * options.tuning.chi2_epsilon
+    def __init__(self, graph: FactorGraph, search: BatchSearch = _USUAL, events: BatchEvents = _NOBODY) -> None:
+        options = Options(mode="all-batch", tuning=Tuning(constrain_last_pose=False))
+        tuning = options.tuning
+        self._rule = StoppingRule(
+            tuning.converge_tolerance if search.polish else _UNPOLISHED, 1e-8 * tuning.chi2_epsilon, 0,
+            polish=_POLISH if search.polish else 0,
+        )  # fmt: skip
+        self._hills = tuning.max_nonmonotone_steps
+        self._search, self._events = search, events
         self.graph, none = graph, (0,) * at.COUNTS
         self._system = System(graph, Incremental(Elimination(options), options))
         self._suspects = find_undetermined(graph, none)
@@ -74,12 +90,20 @@ class Descents:
             )
         self._system.blocks.extend(graph, none)
 
+    def memory_bytes(self) -> int:
+        """Bytes that the graph, Λ and R take, and the most that a start takes beside these; Λ is ordered for it."""
+        elimination, counts = self._system.factor.elimination, self.graph.counts
+        symbolic = elimination.analyze(self.graph, self._system.blocks, Stopwatch(None))
+        pattern = symbolic.blocks.nbytes + symbolic.fronts.nbytes + symbolic.runs.nbytes + symbolic.separator.nbytes
+        factors, averaging = 8 * symbolic.arena, _AVERAGED_FACTOR * int(counts[at.FACTORS]) + 4 * symbolic.arena
+        return self.graph.memory_bytes() + self._system.memory_bytes() - factors + pattern + max(factors, averaging)
+
     def begin(self, start: str, values: F64) -> Descent:
         """A start.  Raises NotFinite where it has no χ²."""
         chi2 = self.chi2(values)
         if not np.isfinite(chi2):
             raise errors.NotFinite(f"χ² of the start {start!r}")
-        return Descent(start, values, chi2)
+        return Descent(start, values, chi2, began=chi2)
 
     def chi2(self, values: F64) -> float:
         """Σ rᵀ Ω r at `values`."""
@@ -92,22 +116,25 @@ class Descents:
         failed: errors.SolverError | None = None
         while going := [each for each in descents if not each.ended]:
             for each in going:
+                if any(_is_hopeless(each, other) for other in descents if other is not each):
+                    each.ended = True
+                    continue
                 try:
-                    self._go_on(each)
+                    self._go_on(each, alone=len(descents) == 1, first=each is descents[0])
                 except errors.Underconstrained as problem:
                     failed = failed or problem
                     descents.remove(each)
                     continue
                 over = [_is_over(each, other) for other in descents if other is not each]
-                each.ended = True in over or each.converged or each.tries >= _MOST
+                each.ended = True in over or each.converged or each.tries >= self._search.max_iterations
         if failed is not None and not descents:
             raise failed
         lowest = min(each.chi2 for each in descents)
         equal = [each for each in descents if each.chi2 <= lowest * (1.0 + _EQUAL) + NOTHING]
         return min(equal, key=lambda each: (not each.converged, STARTS.index(each.start)))
 
-    def _go_on(self, descent: Descent) -> None:
-        """The next few tries."""
+    def _go_on(self, descent: Descent, alone: bool, first: bool) -> None:
+        """The next few tries; all that there may be if there is no other start."""
         graph, system = self.graph, self._system
         graph.values = descent.values.copy()
         system.begin(self._suspects, Stopwatch(None))
@@ -115,15 +142,37 @@ class Descents:
             descent.converged = True
             return
         system.anew()
-        tolerance, floor = self._rule
-        result = minimize(system, descent.chi2, descent.damping, StoppingRule(tolerance, floor, _CHUNK, polish=_POLISH))
+        tries = self._search.max_iterations - descent.tries
+        if not alone:
+            tries = min(tries, _FIRST_CHUNK if first and not descent.tries else _CHUNK)
+        rule = replace(self._rule, limit=tries, nonmonotone=self._hills if descent.damping == 0.0 else 0)
+        result = minimize(system, descent.chi2, descent.damping, rule, tell=self._telling(descent))
         if result.failed >= 0 and result.iterations == 0:
             raise system.underconstrained(system.variable_of(result.failed))
         descent.rate = descent.chi2 / result.chi2 if result.chi2 > 0.0 else np.inf
         descent.values, descent.chi2, descent.damping = graph.values, max(result.chi2, 0.0), result.damping
         descent.iterations += result.iterations
-        descent.tries += _CHUNK
-        descent.converged = result.converged
+        descent.tries += tries
+        descent.converged, descent.left = result.converged, result.left
+
+    def _telling(self, descent: Descent) -> Callable[[Minimization], None]:
+        before = descent.iterations
+
+        def tell(result: Minimization) -> None:
+            self._events.on_iteration(descent.start, before + result.iterations, result.chi2, result.damping)
+
+        return tell
+
+
+def _is_hopeless(descent: Descent, other: Descent) -> bool:
+    """Whether a start that has not been tried need not be."""
+    return (
+        other.converged
+        and other.start == ROTATIONS
+        and other.began <= _TIGHT * other.chi2
+        and not descent.tries
+        and descent.chi2 > _ABOVE * other.chi2
+    )
 
 
 def _is_over(descent: Descent, other: Descent) -> bool:

@@ -1,0 +1,110 @@
+"""`factorbus solve`: a whole graph at its optimum, without a map."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from factorbus.cli.driving.solving import SolveRequest
+from factorbus.cli.output.exits import FAILED, OK, require
+from factorbus.cli.process.options import Number, checked_output, file_argument, grouped, json_option, out_option
+from factorbus.cli.process.reading import reading_options
+from factorbus.proto.kinds import LOSSES
+from factorbus.proto.problems import BadSymbol
+from factorbus.proto.symbols import parse_symbol
+
+_STARTS = ("best", "odometry", "file", "rotations")
+
+
+class _Loss(click.ParamType):
+    """NAME or NAME:SCALE, as (name, scale)."""
+
+    name = "loss"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        if isinstance(value, tuple):
+            return value
+        loss, _, scale = str(value).partition(":")
+        if loss not in LOSSES:
+            self.fail(
+                f"there is no loss {loss!r}; wanted one of {', '.join(LOSSES)}, and a scale: huber:1.0", param, ctx
+            )
+        return loss, Number(0, min_open=True).convert(scale or "1.0", param, ctx)
+
+
+def _covariance(ctx: click.Context, parameter: click.Parameter, text: str | None) -> Path | tuple[int, ...] | None:
+    """A file to write, or keys."""
+    if text is None:
+        return None
+    if text.endswith(".csv"):
+        return checked_output(ctx, parameter, Path(text))
+    try:
+        return tuple(parse_symbol(each) for each in text.split(","))
+    except BadSymbol as problem:
+        raise click.BadParameter(f"{problem}; or a file, FILE.csv", param=parameter) from problem
+
+
+@click.command()
+@grouped("request", SolveRequest)
+@file_argument("file")
+@out_option(
+    "--out",
+    "out",
+    "Write the graph at its optimum, or the trajectory, in the form of the ending.",
+    "FILE.g2o|.pyfg|.jrl|.tum|.kitti",
+)
+@click.option(
+    "--start",
+    type=click.Choice(_STARTS),
+    default="best",
+    show_default=True,
+    help="Where to begin: composed odometry, the file's values, averaged rotations, or whichever of them ends lowest.",
+)
+@click.option("--loss", type=_Loss(), metavar="NAME:SCALE", help="Robust loss of all factors that close loops.")
+@click.option("--gnc", is_flag=True, help="Find the false ones among these by graduated non-convexity; leave them out.")
+@click.option(
+    "--probability",
+    type=Number(0, 1, min_open=True, max_open=True),
+    default=0.99,
+    show_default=True,
+    help="With --gnc: with which a right measurement is kept.",
+)
+@click.option(
+    "--covariance",
+    callback=_covariance,
+    metavar="KEYS|FILE.csv",
+    help="Covariance of x5,l3,... at the optimum; or of all variables, into a file.",
+)
+@click.option("--max-iterations", type=click.IntRange(1), default=500, show_default=True, help="Of one start.")
+@click.option("--cores", type=click.IntRange(1), metavar="N", help="Use N of them.  [default: all there are]")
+@reading_options
+@json_option
+def command(request: SolveRequest, as_json: bool) -> int:
+    """Optimize the graph in FILE (any that `factorbus replay` reads, or a data set's name) and be done: no map, no bus.
+
+    Levenberg-Marquardt with block Cholesky; a variable without a value gets one from its factors. How much memory it
+    takes is said before, and a graph that needs more than there is is refused.
+
+    \b
+    factorbus solve w10000.g2o --out optimum.g2o
+    factorbus solve sphere2500 --start rotations --covariance x10,x2000
+    factorbus solve lab.g2o --gnc --out lab.tum
+    factorbus solve lab.g2o --loss huber:1.0 --covariance sigmas.csv --json
+
+    \b
+    In the result:
+      starts       χ² of each start;  start: the one whose end is lowest
+      chi2         Σ rᵀ Ω r at the end;  left: what one more Gauss-Newton step would take off it, predicted
+      seconds      search: from the graph in memory to the optimum in memory, loading the solver's kernels included
+    The exit code is 1 where the search has ended before it had converged.
+    """
+    require("service", "factorbus solve")
+    from factorbus.cli.driving.solving import run_solve, solution_rows
+    from factorbus.cli.output import console as screen
+
+    result = run_solve(request)
+    if as_json:
+        screen.document(result)
+    else:
+        screen.table(solution_rows(result), title=str(request.file))
+    return OK if result["converged"] else FAILED

@@ -1,0 +1,219 @@
+"""Whole graphs, from file values and from composed odometry, by ours and by other libraries.
+
+    factorbus bench batch [--quick] [--only NAME,...] [--solvers NAME;...] [--repetitions N] [--seed N] [--json]
+
+Everyone gets the same graph with the same values in memory; reading and making a library's own objects are not on the
+clock, ordering is.  In one process on one core, the solvers in turn, the least of --repetitions; CPU and wall seconds.
+
+    factorbus              as `factorbus solve`: from the start given, composed odometry or averaged rotations
+    factorbus, this start  from the start given and no other
+    gtsam lm, gtsam gn     Levenberg-Marquardt and Gauss-Newton, multifrontal Cholesky; `gtsam lm, qr`: when asked for
+    g2o lm, g2o gn         Eigen's sparse Cholesky, which is what its wheel has
+
+χ² is that of the end of each in g2o's convention; own_chi2 that of GTSAM's factors, whose residuals are other ones.
+Simulated worlds are drawn anew at every run (--seed N draws them again): streets of 10,000 and 100,000 poses, a sphere
+of 10,000, and one of 2,500 with so much noise in its rotations that odometry leads nowhere.
+
+Held against: the lowest χ² of all to 1e-6, on every graph from every start; less CPU time than every other whose χ² is
+within 1 % of that; in the geometric mean a third of that of `gtsam lm`.  The exit code is 1 where one is missed.
+"""
+
+import argparse
+import json
+import os
+import platform
+import secrets
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from bench.batch_solvers import BATCH_SOLVERS, OURS, PEER, BatchSolver, chi2_at_end
+from bench.replays.contestants import Failed
+from bench.replays.problems import ALL, choose, file_of
+from bench.replays.runner import machine, pick_core
+
+from factorbus.cli.driving.columns import merged
+from factorbus.formats import read
+from factorbus.proto.messages import Batch, Variables
+from factorbus.simulate import Spiral, manhattan, sphere
+from factorbus.solver import Options, Solver, chi2_at
+
+_LOWEST, _MEAN = 1e-6, 3.0
+_THERE = 1.01  # an end below this, in χ² of the lowest, is the optimum, perhaps of a slightly different sum
+_ON_REQUEST = ("gtsam lm, qr",)
+_QUICK_SETS = ("intel", "manhattan3500", "killian")
+WORLDS: dict[str, tuple[int, Callable[[int, int], Any]]] = {
+    "streets": (10_000, lambda poses, seed: manhattan(poses, seed)),
+    "streets-large": (100_000, lambda poses, seed: manhattan(poses, seed)),
+    "sphere": (10_000, lambda poses, seed: sphere(poses, seed, spiral=Spiral(100, 100))),
+    "sphere-noisy": (2_500, lambda poses, seed: sphere(poses, seed, sigma_rotation_rad=0.2)),
+}
+_QUICK_WORLDS = {"streets": 2_000, "sphere-noisy": 500}
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """A graph with values for all, and what these are: "file" or "odometry"."""
+
+    dataset: str
+    start: str
+    graph: Batch
+
+
+def main() -> int:
+    """Measure, print; 1 where a bar is missed."""
+    told = _options()
+    if (core := pick_core()) is not None:
+        os.sched_setaffinity(0, {core})
+    solvers, notes = _solvers(told.solvers)
+    rows = []
+    for started in graphs(told.quick, told.only, told.seed):
+        print(f"{started.dataset}, {started.start}", file=sys.stderr)
+        rows += measured(started, solvers, told.repetitions or (1 if told.quick else 5))
+    verdicts = judged(rows)
+    result = {"machine": machine(), "python": platform.python_version(), "seed": told.seed, "notes": notes}
+    result |= {"rows": rows, "targets": verdicts}
+    print(json.dumps(result, indent=1) if told.json else text(result))
+    return 0 if all(each["met"] for each in verdicts) else 1
+
+
+def graphs(quick: bool, only: Sequence[str], seed: int) -> Iterator[Started]:
+    """The public data sets that are here, and worlds."""
+    chosen, _ = choose(False, ALL)
+    for problem in chosen:
+        if (only and problem.name not in only) or problem.is_world or (quick and problem.name not in _QUICK_SETS):
+            continue
+        graph = read(file_of(problem.name)).whole()
+        yield Started(problem.name, "odometry", composed(graph))
+        if all(group.values is not None for group in graph.variables):
+            yield Started(problem.name, "file", graph)
+    for name, (poses, world) in WORLDS.items():
+        if (only and name not in only) or (quick and name not in _QUICK_WORLDS):
+            continue
+        poses = _QUICK_WORLDS[name] if quick else poses
+        steps = [step.batch for step in islice(world(poses, seed), poses)]
+        yield Started(f"{name}-{poses}", "odometry", composed(merged(steps)))
+
+
+def composed(graph: Batch) -> Batch:
+    """The same with every free variable as the factors compose it."""
+    bare = [group if group.fixed else Variables(group.kind, group.keys) for group in graph.variables]
+    solver = Solver(Options(mode="inc-l", max_iterations=0))
+    solver.stage(Batch(tuple(bare), graph.factors))
+    solver.step()
+    return Batch(tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in solver.estimate()), graph.factors)
+
+
+def measured(started: Started, solvers: Sequence[BatchSolver], repetitions: int) -> list[dict[str, Any]]:
+    """A row for each solver; the solvers take turns."""
+    graph, best, ready = started.graph, dict[str, dict[str, Any]](), {}
+    at_start = chi2_at(graph.variables, graph.factors, graph.variables)
+    for solver in solvers:
+        row = {"dataset": started.dataset, "start": started.start, "solver": solver.name, "status": "done"}
+        row |= {"chi2_start": at_start, "cpu_s": inf, "wall_s": inf, "iterations": 0, "chi2": inf, "own_chi2": None}
+        best[solver.name] = row | {"versions": {solver.package: solver.version}, "repetitions": repetitions}
+        try:
+            ready[solver.name] = solver.prepare(graph)
+        except Failed as problem:
+            best[solver.name]["status"] = f"failed: {problem}"
+    for repetition in range(repetitions + 1):  # the first loads kernels, and is not counted
+        for name, prepared in list(ready.items()):
+            prepared.reset()
+            wall, cpu = time.perf_counter(), time.process_time()
+            try:
+                end = prepared.run()
+            except Failed as problem:
+                best[name]["status"] = f"failed: {problem}"
+                del ready[name]
+                continue
+            cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+            row = best[name]
+            if repetition == 0:
+                row |= {"iterations": end.iterations, "chi2": chi2_at_end(graph, end), "own_chi2": end.own_chi2}
+            else:
+                row |= {"cpu_s": min(row["cpu_s"], cpu), "wall_s": min(row["wall_s"], wall)}
+    return [
+        row if row["status"] == "done" else row | {"cpu_s": None, "wall_s": None, "chi2": None} for row in best.values()
+    ]
+
+
+def judged(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What was held against it, what was seen, and whether that is met."""
+    verdicts, ratios = [], []
+    for ours in (row for row in rows if row["solver"] == OURS):
+        here = [row for row in rows if (row["dataset"], row["start"]) == (ours["dataset"], ours["start"])]
+        done = [row for row in here if row["status"] == "done"]
+        where = f"{ours['dataset']}, {ours['start']}"
+        lowest = min(row["chi2"] for row in done)
+        seen = ours["chi2"] / lowest - 1.0 if lowest > 0.0 else 0.0
+        verdicts.append({"what": f"{where}: lowest χ² to 1e-6", "seen": f"{seen:.1e} above", "met": seen <= _LOWEST})
+        for row in done:
+            if row["solver"].startswith(OURS) or row["chi2"] > _THERE * lowest:
+                continue
+            ratio = row["cpu_s"] / ours["cpu_s"]
+            verdicts.append(
+                {"what": f"{where}: faster than {row['solver']}", "seen": f"{ratio:.2f}", "met": ratio > 1.0}
+            )
+            if row["solver"] == PEER:
+                ratios.append(ratio)
+    if ratios:
+        mean = float(np.exp(np.mean(np.log(ratios))))
+        what = f"{PEER} over ours, geometric mean of {len(ratios)}"
+        verdicts.append({"what": what, "seen": f"{mean:.2f}", "met": mean >= _MEAN})
+    return verdicts
+
+
+def text(result: dict[str, Any]) -> str:
+    """A table, and the bars that were missed."""
+    lines = [
+        *result["notes"],
+        "| graph | start | solver | cpu | wall | iterations | χ² |",
+        "|---|---|---|---:|---:|---:|---:|",
+    ]
+    for row in result["rows"]:
+        told = [row["dataset"], row["start"], row["solver"]]
+        if row["status"] == "done":
+            told += [f"{1e3 * row['cpu_s']:.1f} ms", f"{1e3 * row['wall_s']:.1f} ms", str(row["iterations"])]
+            told.append(f"{row['chi2']:.9g}")
+        else:
+            told += [row["status"], "", "", ""]
+        lines.append(f"| {' | '.join(told)} |")
+    missed = [f"missed: {each['what']} ({each['seen']})" for each in result["targets"] if not each["met"]]
+    met = len(result["targets"]) - len(missed)
+    mean = [f"{each['what']}: {each['seen']}" for each in result["targets"][-1:]]
+    return "\n".join([*lines, "", *mean, f"{met} of {len(result['targets'])} bars met, seed {result['seed']}", *missed])
+
+
+def _solvers(names: Sequence[str]) -> tuple[list[BatchSolver], list[str]]:
+    """Those that are asked for and here, and a line for each that is not here."""
+    wanted = [each for each in BATCH_SOLVERS if (each.name in names if names else each.name not in _ON_REQUEST)]
+    if unknown := sorted(set(names) - {each.name for each in BATCH_SOLVERS}):
+        sys.exit(f"--solvers {','.join(unknown)}: there are {'; '.join(each.name for each in BATCH_SOLVERS)}")
+    absent = [f"Not measured: {each.name} ({each.package} is not installed)." for each in wanted if each.missing]
+    return [each for each in wanted if not each.missing], absent
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    listed = lambda text: [word.strip() for word in text.split(",") if word.strip()]  # noqa: E731
+    solvers = lambda text: [word.strip() for word in text.split(";") if word.strip()]  # noqa: E731
+    parser.add_argument("--quick", action="store_true", help="three small data sets and two small worlds: two minutes")
+    parser.add_argument("--only", type=listed, default=[], metavar="NAME,...", help="these data sets and worlds")
+    parser.add_argument("--solvers", type=solvers, default=[], metavar="NAME;...", help="these solvers")
+    parser.add_argument("--repetitions", type=int, default=0, metavar="N", help="of each; the least counts (5)")
+    parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6) + 1, metavar="N", help="of the worlds")
+    parser.add_argument("--json", action="store_true", help="print the document")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

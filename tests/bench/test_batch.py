@@ -1,0 +1,77 @@
+"""`bench batch`: the solvers come to one optimum, bars are held against rows, and the whole command on one world."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bench import batch
+from bench.batch_solvers import BATCH_SOLVERS, OURS, OURS_ALONE, PEER, chi2_at_end
+
+from factorbus.cli.driving.columns import merged
+from factorbus.simulate import Spiral, city_trees, manhattan, sphere
+
+BATCH = Path(__file__).parent / "batch.py"
+WORLDS = {
+    "streets": lambda: manhattan(120, 3),
+    "trees": lambda: city_trees(60, 3),
+    "sphere": lambda: sphere(120, 3, spiral=Spiral(20, 6)),
+}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_all_solvers_come_to_the_same_optimum_however_often(world: str) -> None:
+    graph = batch.composed(merged(step.batch for step in WORLDS[world]()))
+    ends: dict[str, float] = {}
+    for solver in BATCH_SOLVERS:
+        prepared = solver.prepare(graph)
+        for _ in range(2):
+            prepared.reset()
+            end = prepared.run()
+            assert end.iterations > 0
+            ends.setdefault(solver.name, chi2_at_end(graph, end))
+            assert chi2_at_end(graph, end) == pytest.approx(ends[solver.name], rel=1e-9)
+    assert min(ends.values()) == pytest.approx(ends[OURS], rel=1e-6)
+    assert max(ends.values()) <= batch._THERE * ends[OURS]
+
+
+def row(solver: str, cpu_s: float, chi2: float = 10.0, status: str = "done") -> dict[str, Any]:
+    return {"dataset": "a", "start": "file", "solver": solver, "cpu_s": cpu_s, "chi2": chi2, "status": status}
+
+
+def missed(*rows: dict[str, Any]) -> list[str]:
+    return [each["what"] for each in batch.judged(rows) if not each["met"]]
+
+
+def test_bars() -> None:
+    assert missed(row(OURS, 1.0), row(OURS_ALONE, 0.5), row(PEER, 3.5)) == []
+    assert missed(row(OURS, 1.0), row(PEER, 2.0)) == ["gtsam lm over ours, geometric mean of 1"]
+    assert missed(row(OURS, 1.0), row("g2o gn", 0.9)) == ["a, file: faster than g2o gn"]
+    assert missed(row(OURS, 1.0, 10.1), row("g2o gn", 2.0)) == ["a, file: lowest χ² to 1e-6"]
+    assert missed(row(OURS, 1.0), row("g2o gn", 0.1, 11.0)) == []  # it is elsewhere
+    assert missed(row(OURS, 1.0), row(PEER, 0.0, 0.0, "failed: indeterminate")) == []
+
+
+@pytest.mark.timeout(280)
+def test_the_command_prints_a_document() -> None:
+    arguments = ["--quick", "--only", "streets", "--seed", "5", "--solvers", f"{OURS}; {PEER}", "--json"]
+    ran = subprocess.run([sys.executable, str(BATCH), *arguments], capture_output=True, text=True, check=False)
+    assert ran.returncode in (0, 1), ran.stderr
+    told = json.loads(ran.stdout)
+    assert told["seed"] == 5
+    assert [each["solver"] for each in told["rows"]] == [OURS, PEER]
+    ours = told["rows"][0]
+    assert {"dataset", "start", "cpu_s", "wall_s", "iterations", "chi2", "versions"} <= set(ours)
+    assert ours["chi2"] <= (1 + 1e-6) * told["rows"][1]["chi2"]
+    assert 0 < ours["cpu_s"] <= 1.1 * ours["wall_s"] + 0.01
+    assert "gtsam" in told["rows"][1]["versions"]
+
+
+def test_a_solver_that_is_not_there_is_refused() -> None:
+    ran = subprocess.run(
+        [sys.executable, str(BATCH), "--solvers", "gtsan"], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 1
+    assert "there are factorbus; " in ran.stderr
