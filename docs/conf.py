@@ -18,6 +18,8 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "borrowed", "docstrings", "he
 exclude_patterns = ["machinery", "notebooks/*.py"]
 
 html_theme = "furo"
+html_static_path = ["static"]
+html_css_files = ["beside.css"]
 html_title = f"factorbus {release}"
 html_copy_source = False
 html_show_sourcelink = False

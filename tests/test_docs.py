@@ -15,6 +15,7 @@ from factorbus.cli.commands.explain import read_pages
 sys.path.insert(0, str(ROOT / "docs" / "machinery"))
 TUTORIALS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "tutorials").glob("*.md"))
 CONCEPTS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "concepts").glob("*.md"))
+CHOOSING = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "choosing").glob("*.md"))
 needs_docs = pytest.mark.skipif(
     find_spec("sphinx") is None or find_spec("myst_parser") is None, reason="pip install 'factorbus[docs]'"
 )
@@ -85,7 +86,7 @@ def test_docstrings_are_read_as_they_are_meant() -> None:
     assert said[6:9] == ["::", "", "    a (n,)   of `b`s"]
 
 
-@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS])
+@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS, *CHOOSING])
 def test_every_block_runs_as_it_stands(document: str, tmp_path: Path) -> None:
     walk(document, tmp_path)
 
@@ -99,7 +100,7 @@ def test_the_notebooks_run_from_top_to_bottom(tmp_path: Path) -> None:
             assert run("bash", f"python '{script}'")
 
 
-@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS])
+@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS, *CHOOSING])
 def test_no_block_is_left_out(document: str) -> None:
     fences = re.findall(r"^```(.*)$", (ROOT / document).read_text(encoding="utf-8"), re.M)
     assert fences[::2] == [language for language, _ in blocks(document)]
