@@ -47,7 +47,19 @@ def test_the_python_api_is_there_with_its_docstrings(site: Path) -> None:
     page = (site / "api" / "client.html").read_text()
     for name in ("factorbus.client.connect", "factorbus.client.Draft.between_se2", "factorbus.client.Map.insert"):
         assert f'id="{name}"' in page
+    documented = re.findall(r'id="factorbus\.client\.(\w+)"', page)
+    assert [name for name in documented if name in ("connect", "Map", "Draft", "AbsoluteFactors")] == [
+        "connect", "Map", "Draft", "AbsoluteFactors",
+    ]  # fmt: skip
     assert "Mahalanobis" in (site / "api" / "proto.html").read_text()
+
+
+@needs_docs
+def test_equations_are_drawn(site: Path) -> None:
+    page = (site / "reference" / "solver-math.html").read_text()
+    assert page.count("<math>") > 100
+    assert '<span class="number">(9.32)</span>' in page
+    assert "converged_share" in page
 
 
 @needs_docs

@@ -6,7 +6,7 @@ A service of its own is started for each world, and a robot drives through it, a
 A viewer, another session, takes every delta and counts its bytes.  Before that a short drive on another map, which is
 dropped, has loaded the kernels.  At each number of poses a row:
 
-memory       resident memory of the service, less what it was before the drive; a pose's share of it
+memory       resident memory of the service, less what it was before the drive (given as well); a pose's share of it
 CPU          user and system time of the service by then, all threads, bus included; inserts in a second of it
 delta        bytes published after one insert: the values that the step changed, mean, median, 99 %
 estimate     bytes of the whole estimate, which a viewer fetches once when it joins
@@ -46,7 +46,7 @@ from factorbus.proto.version import __version__
 from factorbus.simulate import WORLDS
 
 WARM_UP = 60  # poses
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0  # of one step: where a whole map moves, on a machine with other work
 TICKS = os.sysconf("SC_CLK_TCK")
 PAGE = os.sysconf("SC_PAGE_SIZE")
 
@@ -106,6 +106,7 @@ def drive(world: str, marks: list[int], window: int, seed: int) -> Iterator[dict
                     "world": world,
                     "poses": mark,
                     "factors": factors,
+                    "idle_bytes": before,
                     "memory_bytes": resident(pid) - before,
                     "cpu_s": round(cpu_seconds(pid) - began, 3),
                     "delta_bytes": [round(float(np.mean(deltas))), *map(int, np.percentile(deltas, (50, 99)))]
@@ -174,6 +175,8 @@ def table(result: dict[str, Any]) -> str:
             f"{row['cpu_s']:>8.2f}{poses / row['cpu_s']:>15,.0f}{deltas[0]:>16}{deltas[1]:>8}{deltas[2]:>8}"
             f"{row['estimate_bytes'] / 1e3:>13.0f}{trip:>8}"
         )
+    idle = max((row["idle_bytes"] for row in result["rows"]), default=0)
+    lines.append(f"a service before the drive, kernels loaded: {idle / 1e6:.0f} MB")
     versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
     lines.append(
         f"window {result['window']}, seed {result['seed']}; {versions}; "
