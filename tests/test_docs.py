@@ -4,6 +4,7 @@ documents tell one to type works, typed in that order."""
 import re
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -110,6 +111,37 @@ def test_the_notebooks_run_from_top_to_bottom(tmp_path: Path) -> None:
         run("bash", "factorbus serve")
         for script in scripts:
             assert run("bash", f"python '{script}'")
+
+
+@pytest.mark.parametrize("peer", ["gtsam", "g2o"])
+def test_a_program_prints_the_same_with_a_peer_and_with_us(peer: str, tmp_path: Path) -> None:
+    """To 1e-3 of each number: a GTSAM factor measures the error of a relative pose differently."""
+    service, theirs, ours = blocks(f"docs/choosing/from-{peer}.md")[:3]
+    with walker(tmp_path) as run:
+        run(*service)
+        said = [run(*each) for each in (theirs, ours)]
+    words, numbers = zip(*((re.sub(r"[-\d.]+", "0", each).split(), numbers_of(each)) for each in said), strict=True)
+    assert words[0] == words[1]
+    assert len(numbers[0]) >= 4
+    assert numbers[0] == pytest.approx(numbers[1], abs=1e-3)
+
+
+def numbers_of(said: str) -> list[float]:
+    """All that stand by themselves in what was printed."""
+    return [float(each) for each in re.findall(r"(?<![\w.])-?\d+\.\d*", said)]
+
+
+@pytest.mark.parametrize("peer", ["gtsam", "g2o"])
+def test_names_of_a_peer_are_those_of_its_wheel(peer: str) -> None:
+    """In the first column of the tables: a class, a method or a parameter of one."""
+    wheel = import_module({"gtsam": "gtsam", "g2o": "g2opy"}[peer])
+    there = set(dir(wheel)).union(*(dir(getattr(wheel, name)) for name in dir(wheel)))
+    text = (ROOT / "docs" / "choosing" / f"from-{peer}.md").read_text(encoding="utf-8")
+    cells = re.findall(r"^\| (.*?) \|", text, re.M)
+    named = {name for cell in cells for name in re.findall(r"`([A-Z][A-Za-z0-9_]{4,})", cell)}
+    assert len(named) > 10
+    in_cpp_alone = {"IndeterminantLinearSystemException", "Vector", "BaseBinaryEdge"}
+    assert named - there - in_cpp_alone == set()
 
 
 @pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS, *CHOOSING])
