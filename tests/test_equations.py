@@ -32,6 +32,7 @@ def test_every_equation_is_drawn_with_every_sign(document: str) -> None:
 
 def test_what_is_written_is_what_is_drawn() -> None:
     assert mathml("R_zᵀ") == "<msubsup><mrow><mi>R</mi></mrow><mrow><mi>z</mi></mrow><mrow><mi>T</mi></mrow></msubsup>"
+    assert "<mtext>\u00a0with\u00a0</mtext>" in mathml("t with ρ")
     assert mathml("sin θ") == "<mtext>sin\u00a0</mtext><mi>θ</mi>"
     assert mathml("√(x + 1)").startswith("<msqrt><mo>(</mo><mi>x</mi><mo>+</mo><mn>1</mn>")
     assert mathml("[ A  0 ; 0  1 ]").count("<mtr>") == 2

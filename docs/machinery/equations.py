@@ -119,13 +119,14 @@ def _atom(text: str, at: int) -> tuple[str, int]:
     ), found.end()
 
 
-def _drawn(kind: str, text: str, after: str) -> str:
+def _drawn(kind: str, text: str, before: str, after: str) -> str:
     if kind == "number":
         return f"<mn>{text}</mn>"
     if kind == "letter":
         return f"<mi>{text}</mi>"
-    # A word keeps the blank behind it: `sin θ`, `up to k`.
-    words = escape(text).replace(" ", "\u00a0") + ("\u00a0" if after == " " else "")
+    # A word keeps the blanks beside it: `t with ρ`.
+    words = ("\u00a0" if before == " " else "") + escape(text) + ("\u00a0" if after == " " else "")
+    words = words.replace(" ", "\u00a0")
     return f'<mtext class="option">{words}</mtext>' if kind == "code" else f"<mtext>{words}</mtext>"
 
 
