@@ -95,8 +95,8 @@ docs: $(READY_DEV) ## build the site into out/docs, and check every link in it
 	@$(BIN)/python docs/machinery/build.py out/docs
 
 pictures: $(READY_DEV) ## draw the pictures of the README and the site again
-	@$(BIN)/factorbus simulate manhattan --poses 1500 --seed 7 --out $(BIN)/../town.g2o
-	@$(BIN)/factorbus plot map $(BIN)/../town.g2o --solve --out docs/town.png
+	@$(BIN)/factorbus simulate manhattan --poses 1500 --seed 7 --out $(BIN)/../town.jrl
+	@$(BIN)/factorbus plot map $(BIN)/../town.jrl --solve --out docs/town.png
 	@$(BIN)/factorbus simulate manhattan --poses 800 --seed 7 --out $(BIN)/../town.g2o
 	@$(BIN)/factorbus plot map $(BIN)/../town.g2o --solve --ellipses 40 --out docs/figures/town-map.png
 	@for what in sparsity tree drive; do $(BIN)/factorbus plot $$what $(BIN)/../town.g2o --out docs/figures/town-$$what.png; done

@@ -14,10 +14,12 @@ project = "factorbus"
 author = "The factorbus developers"
 release = version = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "borrowed", "docstrings", "helped"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "borrowed", "equations", "docstrings", "helped"]
 exclude_patterns = ["machinery", "notebooks/*.py"]
 
 html_theme = "furo"
+html_static_path = ["static"]
+html_css_files = ["pages.css"]
 html_title = f"factorbus {release}"
 html_copy_source = False
 html_show_sourcelink = False

@@ -4,6 +4,7 @@ documents tell one to type works, typed in that order."""
 import re
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from factorbus.cli.commands.explain import read_pages
 sys.path.insert(0, str(ROOT / "docs" / "machinery"))
 TUTORIALS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "tutorials").glob("*.md"))
 CONCEPTS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "concepts").glob("*.md"))
+CHOOSING = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "choosing").glob("*.md"))
 needs_docs = pytest.mark.skipif(
     find_spec("sphinx") is None or find_spec("myst_parser") is None, reason="pip install 'factorbus[docs]'"
 )
@@ -46,7 +48,19 @@ def test_the_python_api_is_there_with_its_docstrings(site: Path) -> None:
     page = (site / "api" / "client.html").read_text()
     for name in ("factorbus.client.connect", "factorbus.client.Draft.between_se2", "factorbus.client.Map.insert"):
         assert f'id="{name}"' in page
+    documented = re.findall(r'id="factorbus\.client\.(\w+)"', page)
+    assert [name for name in documented if name in ("connect", "Map", "Draft", "AbsoluteFactors")] == [
+        "connect", "Map", "Draft", "AbsoluteFactors",
+    ]  # fmt: skip
     assert "Mahalanobis" in (site / "api" / "proto.html").read_text()
+
+
+@needs_docs
+def test_equations_are_drawn(site: Path) -> None:
+    page = (site / "reference" / "solver-math.html").read_text()
+    assert page.count("<math>") > 100
+    assert '<span class="number">(9.32)</span>' in page
+    assert "converged_share" in page
 
 
 @needs_docs
@@ -85,7 +99,7 @@ def test_docstrings_are_read_as_they_are_meant() -> None:
     assert said[6:9] == ["::", "", "    a (n,)   of `b`s"]
 
 
-@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS])
+@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS, *CHOOSING])
 def test_every_block_runs_as_it_stands(document: str, tmp_path: Path) -> None:
     walk(document, tmp_path)
 
@@ -99,7 +113,38 @@ def test_the_notebooks_run_from_top_to_bottom(tmp_path: Path) -> None:
             assert run("bash", f"python '{script}'")
 
 
-@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS])
+@pytest.mark.parametrize("peer", ["gtsam", "g2o"])
+def test_a_program_prints_the_same_with_a_peer_and_with_us(peer: str, tmp_path: Path) -> None:
+    """To 1e-3 of each number: a GTSAM factor measures the error of a relative pose differently."""
+    service, theirs, ours = blocks(f"docs/choosing/from-{peer}.md")[:3]
+    with walker(tmp_path) as run:
+        run(*service)
+        said = [run(*each) for each in (theirs, ours)]
+    words, numbers = zip(*((re.sub(r"[-\d.]+", "0", each).split(), numbers_of(each)) for each in said), strict=True)
+    assert words[0] == words[1]
+    assert len(numbers[0]) >= 4
+    assert numbers[0] == pytest.approx(numbers[1], abs=1e-3)
+
+
+def numbers_of(said: str) -> list[float]:
+    """All that stand by themselves in what was printed."""
+    return [float(each) for each in re.findall(r"(?<![\w.])-?\d+\.\d*", said)]
+
+
+@pytest.mark.parametrize("peer", ["gtsam", "g2o"])
+def test_names_of_a_peer_are_those_of_its_wheel(peer: str) -> None:
+    """In the first column of the tables: a class, a method or a parameter of one."""
+    wheel = import_module({"gtsam": "gtsam", "g2o": "g2opy"}[peer])
+    there = set(dir(wheel)).union(*(dir(getattr(wheel, name)) for name in dir(wheel)))
+    text = (ROOT / "docs" / "choosing" / f"from-{peer}.md").read_text(encoding="utf-8")
+    cells = re.findall(r"^\| (.*?) \|", text, re.M)
+    named = {name for cell in cells for name in re.findall(r"`([A-Z][A-Za-z0-9_]{4,})", cell)}
+    assert len(named) > 10
+    in_cpp_alone = {"IndeterminantLinearSystemException", "Vector", "BaseBinaryEdge"}
+    assert named - there - in_cpp_alone == set()
+
+
+@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS, *CHOOSING])
 def test_no_block_is_left_out(document: str) -> None:
     fences = re.findall(r"^```(.*)$", (ROOT / document).read_text(encoding="utf-8"), re.M)
     assert fences[::2] == [language for language, _ in blocks(document)]

@@ -13,7 +13,7 @@ from factorbus.cli.process.options import json_option
 
 BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
 LONG = ("every-step", "paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
-ASKED = ("ask", "batch", "digest", "calibration", "inertial", "own", "ranges")  # a minute or two; on request
+ASKED = ("ask", "batch", "digest", "calibration", "inertial", "own", "ranges", "sizing")  # a minute or two; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -54,6 +54,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
                every step over its batch optimum, and GTSAM's optimum; --only, --every, --steps
     own        a kind of factor written as a formula beside the built-in one, and a Python factor in GTSAM: time of a
                step; --only, --poses
+    sizing     what simulated worlds need: memory of a pose, CPU time of an insert, bytes for a viewer; --worlds,
+               --poses, --window
     all        cholesky, bus, idp, ros2 and journal: some minutes
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
