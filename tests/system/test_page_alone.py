@@ -46,8 +46,14 @@ def floats(*numbers: float) -> bytes:
     return np.array(numbers, "<f8").tobytes()
 
 
+def packed(message: dict[str, Any]) -> bytes:
+    made = msgpack.packb(message)
+    assert made is not None
+    return made
+
+
 def ask(client: Bare, to: str, **message: Any) -> Any:
-    return sent(client, to, msgpack.packb(message))
+    return sent(client, to, packed(message))
 
 
 def sent(client: Bare, to: str, payload: bytes) -> Any:
@@ -100,7 +106,7 @@ def test_why_of_an_outlier_has_r_its_weight_and_what_is_gained_without_it(client
     point = {"kind": "point2", "keys": ints("l1"), "values": floats(0, 0)}
     insert(client, name, variables=[point], factors=[*near, far], settle=True)
     rho = LOSSES[loss]
-    best = minimize_scalar(
+    best: Any = minimize_scalar(
         lambda x: x**2 + (x - 0.1) ** 2 + rho((x - 4) ** 2, k), bounds=(-1, 2), options={"xatol": 1e-9}
     )
     told = ask(client, f"map/{name}/ask/why", factor=2)["factor"]
@@ -224,7 +230,7 @@ def test_of_a_map_key_that_comes_twice_the_last_counts(client: Bare) -> None:
 
 def test_the_second_run_of_a_name_gets_the_old_answer_to_the_same_bytes_and_else_bad_sequence(client: Bare) -> None:
     chain(client, "runs")
-    first = msgpack.packb({"sequence": 1})
+    first = packed({"sequence": 1})
     answer = client.ask(f"{HERE}/map/runs/in/robot", first)
     assert client.ask(f"{HERE}/map/runs/in/robot", first) == answer
     refused(ask(client, "map/runs/in/robot", sequence=1, settle=True), "bad_sequence", next=2)
