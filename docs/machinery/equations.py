@@ -114,9 +114,8 @@ def _atom(text: str, at: int) -> tuple[str, int]:
     found = _ATOM.match(text, at)
     if found is None:
         return f"<mo>{escape(sign)}</mo>", at + 1
-    return _drawn(
-        str(found.lastgroup), str(found[str(found.lastgroup)]), text[found.end() : found.end() + 1]
-    ), found.end()
+    kind, end, before = str(found.lastgroup), found.end(), text[at - 1] if at else ""
+    return _drawn(kind, found[kind], before, text[end : end + 1]), end
 
 
 def _drawn(kind: str, text: str, before: str, after: str) -> str:
