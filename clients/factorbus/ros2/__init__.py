@@ -1,7 +1,7 @@
 """Robots that speak ROS 2 over Zenoh (rmw_zenoh), on a map of ours, with no ROS installed on this side.
 
-Odometry, poses, landmark detections, loop closures and fixes of GNSS come in; the correction from map to odometry, the path and
-markers go out.  A client like any other: no compiler.  Needs the extra `ros2`.
+Odometry, poses, landmark detections, loop closures and fixes of GNSS come in; the correction from map to odometry, the
+path and markers go out.  A client like any other: no compiler.  Needs the extra `ros2`.
 
 | module | |
 |---|---|
