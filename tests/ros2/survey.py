@@ -4,7 +4,7 @@ closures, fixes of an antenna off its middle; and the same graph as a draft, by 
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import recordings
@@ -117,7 +117,3 @@ def drafted(made: Survey, closures: bool = True, fixes: bool = True) -> Draft:
 
 
 write = recordings.write_mcap
-
-
-def message_types(messages: list[Said]) -> dict[str, Any]:
-    return {each.topic: each.type_name for each in messages}

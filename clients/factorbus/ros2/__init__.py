@@ -1,7 +1,7 @@
 """Robots that speak ROS 2 over Zenoh (rmw_zenoh), on a map of ours, with no ROS installed on this side.
 
-Odometry, poses with covariance and landmark detections come in; the correction from map to odometry, the path and
-markers go out.  A client like any other: no compiler.  Needs the extra `ros2`.
+Odometry, poses, landmark detections, loop closures and fixes of GNSS come in; the correction from map to odometry, the
+path and markers go out.  A client like any other: no compiler.  Needs the extra `ros2`.
 
 | module | |
 |---|---|
@@ -10,6 +10,9 @@ markers go out.  A client like any other: no compiler.  Needs the extra `ros2`.
 | `node` | a ROS 2 node on a Zenoh session; the only file here that touches zenoh |
 | `geometry`, `certainty` | rigid transforms and their covariances |
 | `track`, `front_end` | from odometry to keyframes, from messages to what is inserted; no bus and no clock |
+| `observations`, `fixes` | landmarks that are seen; places by GNSS, and the frame that these are in |
+| `graphs`, `closures` | graphs of front ends in one form, and their loop closures between keyframes |
+| `mounts`, `message_parts` | where sensors are on the robot; what messages have in common, checked |
 | `display` | an estimate as a path and as markers |
 | `bridge` | all of it together |
 | `recording`, `unfinished_mcap` | what a robot recorded, also where it was cut off |

@@ -67,8 +67,9 @@ def command(
 ) -> None:
     """Join a robot that speaks ROS 2 over Zenoh (rmw_zenoh) to MAP. No ROS is needed on this side.
 
-    Reads odometry, poses with covariance and landmark detections; publishes the transform from map to odometry after
-    every step, a path and markers. Prints `ready` when the robot can begin. Until Ctrl-C.
+    Reads odometry, poses with covariance, landmark detections, loop closures of a front end's graph and fixes of GNSS;
+    publishes the transform from map to odometry after every step, a path and markers. Prints `ready` when the robot can
+    begin. Until Ctrl-C.
 
     \b
     factorbus ros2 warehouse
