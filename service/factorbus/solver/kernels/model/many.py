@@ -30,8 +30,6 @@ from factorbus.solver.kernels.model.losses import loss_of
 from factorbus.solver.kernels.model.similarity import similar
 from factorbus.solver.kernels.model.sizes import dim_of
 
-_FLOATS, _ROWS = types.float64[::1], types.int64[:, ::1]
-
 
 class Many(NamedTuple):
     """A factor linearized: r (dim or R_SIZE,), J (dim, Σ d); start (ends + 1,): the first column of each variable."""
@@ -41,13 +39,18 @@ class Many(NamedTuple):
     start: I64
 
 
+_FLOATS, _ROWS = types.float64[::1], types.int64[:, ::1]
+_MANY = types.NamedTuple((_FLOATS, types.float64[:, ::1], types.int64[::1]), Many)
+_LINEARIZED = types.Tuple((types.float64, _MANY))(types.int64, _ROWS, _ROWS, _FLOATS, _FLOATS, _FLOATS)
+
+
 @inline_kernel
 def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
     """The factor that begins at row f at the values x, whitened and with its loss; what χ² has beside rᵀ r."""
     return linearize_kept(f, var, fac, x, payload, payload[:0])
 
 
-@shared_kernel(types.int64, _ROWS, _ROWS, _FLOATS, _FLOATS, _FLOATS)
+@shared_kernel(_LINEARIZED)
 def linearize_kept(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) -> tuple[float, Many]:
     """The same, of an inertial factor by what is in `kept`, see `imu`."""
     more, many = evaluate_plain(f, var, fac, x, payload, kept)
@@ -59,7 +62,7 @@ def linearize_kept(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) 
     return more, many
 
 
-@part
+@shared_kernel(_LINEARIZED)
 def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) -> tuple[float, Many]:
     """Residual and Jacobians of the factor that begins at row f; what χ² has beside rᵀ Ω r."""
     kind, ends, dim, more = fac[f, at.F_KIND], count_ends(f, fac), residual_size(f, fac), 0.0
