@@ -179,26 +179,6 @@ def test_only_a_constant_counts_from_the_end_and_only_in_our_kernels(kernels):
     assert "IndexError" in checked.stderr
 
 
-ASSIGNED = """
-from kernels.jit import compile as _jit
-
-@_jit.kernel("void(float64[::1], float64[::1])")
-def put(a, b):
-    a[1:3] = {value}
-
-list(_jit.iter_compile(put))
-"""
-
-
-@pytest.mark.skipif(_jit.STOCK, reason="Numba as it is compiles its errors of unlike sizes")
-def test_an_array_is_not_assigned_to_a_part_of_another(kernels):
-    for value, fault in (("0.0", ""), ("b[:2]", "a[…] = an array, ")):
-        (kernels / "assigned.py").write_text(ASSIGNED.format(value=value))
-        done = run(kernels, "import kernels.assigned")
-        assert fault in done.stderr
-        assert (done.returncode == 0) == (not fault)
-
-
 @pytest.mark.skipif(_jit.STOCK, reason="Numba as it is shows all functions of a library")
 def test_a_kernel_shows_others_nothing_of_its_parts(kernels):
     (kernels / "parts.py").write_text(PARTS.format(last=2))

@@ -91,8 +91,6 @@ class OurLower(Lower):
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
         place = self._place_of_number(target_var.name, index_var.name)
         if place is None:
-            if isinstance(self.typeof(value_var.name), types.Array):
-                raise NotImplementedError(f"{target_var.name}[…] = an array, {value_var.name}; assign its numbers")
             return super().lower_setitem(target_var, index_var, value_var, signature)
         array = self.typeof(target_var.name)
         number = self.loadvar(value_var.name)
