@@ -7,7 +7,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 
-from factorbus.solver.kernels.jit.compile import WIRE_KINDS, code_environment
+from factorbus.proto import inertial, kinds
+from factorbus.solver.kernels.jit.compile import code_environment
 
 _LIBRARIES = ("scipy", "scikit-sparse")  # besides those that compile kernels
 
@@ -31,8 +32,8 @@ def _sources() -> str:
     for path in sorted(folder.rglob("*.py")):
         text = path.read_bytes()
         digest.update(f"{path.relative_to(folder).as_posix()} {len(text)}\n".encode() + text)
-    for path in WIRE_KINDS:
-        digest.update(path.read_bytes())
+    for module in (kinds, inertial):  # kernels have their names and sizes as constants
+        digest.update(Path(module.__file__).read_bytes())
     return digest.hexdigest()[:12]
 
 

@@ -8,7 +8,9 @@ from typing import Any
 
 from factorbus.solver import kernels
 from factorbus.solver.covariance import kernels as covariance_kernels
-from factorbus.solver.kernels.jit.compile import compile_seconds, is_on_disk, iter_compile
+from factorbus.solver.kernels.jit.compile import compile_seconds, is_on_disk, iter_compile, only_compile
+
+__all__ = ["iter_compile", "list_missing", "only_compile", "warm"]
 
 
 def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -> float:

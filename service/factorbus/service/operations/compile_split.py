@@ -50,7 +50,8 @@ class CompileSplit:
 
 
 def functions_of(kernel: Any) -> dict[Callable[..., Any], int]:
-    """All that is compiled with `kernel`, itself included: each function's length in bytes of Python's code."""
+    """All that is compiled with `kernel`, itself included, and not what it calls by its address: each function's length
+    in bytes of Python's code."""
     found: dict[Callable[..., Any], int] = {}
     open_ = [kernel.py_func]
     while open_:
@@ -76,5 +77,6 @@ def _called(code: CodeType, names: Mapping[str, Any]) -> Iterator[Callable[..., 
         thing = names.get(name)
         inside = [vars(thing).get(other) for other in code.co_names] if isinstance(thing, ModuleType) else []
         for one in (thing, *inside):
-            if (function := getattr(one, "py_func", None)) is not None:
+            function = getattr(one, "py_func", None)
+            if function is not None and not getattr(one, "factorbus_shared", False):
                 yield function

@@ -4,8 +4,9 @@ A cold start is shared out: one process for each core, and each takes one kernel
 (`compile_split.py`).  Files, made by the process that comes first, show who has what; the kernels themselves meet on
 disk.  Then this process loads them all.
 
-It compiles none itself.  Code that has just been compiled and the same from disk are linked in another order, and may
-round the last bit otherwise; what comes of a journal after a restart is to be what it was, to the bit.
+It compiles none itself, and they run none.  Code that has just been compiled and the same from disk are linked in
+another order, and may round the last bit otherwise; what comes of a journal after a restart is to be what it was, to
+the bit.
 """
 
 import gc
@@ -25,7 +26,7 @@ from factorbus.service import kernels
 from factorbus.service.operations.compile_split import CompileSplit, functions_of
 from factorbus.service.process.memory import available
 from factorbus.service.process.worker_threads import core_count
-from factorbus.solver.warm import iter_compile, list_missing
+from factorbus.solver.warm import iter_compile, list_missing, only_compile
 
 _FEW = 4  # kernels that are worth another process
 _MOST = 8  # processes: compiling takes half a gigabyte of memory each
@@ -77,6 +78,7 @@ def share_out(processes: int, progress: Callable[[str], None] | None) -> None:
 def take_turns(claims: Path, progress: Callable[[str], None]) -> None:
     """Compile one kernel after the other that nobody has claimed."""
     collect_garbage_less()
+    only_compile()
     kernels = {f"{kernel.__module__}.{kernel.__name__}": kernel for kernel in missing_kernels()}
     for name in CompileSplit(claims, {name: functions_of(kernel) for name, kernel in kernels.items()}):
         progress(kernels[name].__name__)

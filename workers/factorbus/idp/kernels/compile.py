@@ -4,12 +4,9 @@ The same features may be computed by any worker, whole or in shards, or in place
 last bits would depend on where a loop was cut; without, only on the numbers.
 """
 
-from pathlib import Path
-
 from factorbus.solver.kernels.jit.compile import DISABLED, F64, I64, KernelFolder, types
-from factorbus.solver.lenses.compile import FOLDER as LENSES
 
 __all__ = ["DISABLED", "F64", "I64", "inline_kernel", "kernel", "part", "types"]
 
-_FOLDER = KernelFolder(Path(__file__).parent, "kernels-idp", exact=True, also=tuple(LENSES.glob("*.py")))
+_FOLDER = KernelFolder("kernels-idp", exact=True)
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

@@ -6,7 +6,7 @@ Every factor is looked at no more than three times, in whatever order they come.
 
 import numpy as np
 
-from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part, shared_kernel, types
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import place_idp
 from factorbus.solver.kernels.model.composed import (
@@ -37,7 +37,10 @@ _NOTHING = -1
 _WAITS = -2
 
 
-@kernel("int64(boolean, int64, int64, int64, int64[::1], int64[::1])")
+_COUNTS = types.int64[::1]
+
+
+@shared_kernel(types.int64(types.boolean, types.int64, types.int64, types.int64, _COUNTS, _COUNTS))
 def reach(compose: bool, v0: int, f0: int, f1: int, graph_table: I64, reached: I64) -> int:
     """Mark in `reached` (one entry per variable from v0 on, 1: reached) what factors f0 .. f1−1 lead to.
 

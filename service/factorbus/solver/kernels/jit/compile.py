@@ -10,10 +10,9 @@ Numba types a part once in a process; each kernel that calls it, also by way of 
 A kernel that is called by another is a part there.
 
 The disk cache is a folder named by a hash of every file beside this one, the flags, the versions of Python, numpy,
-numba and llvmlite, and the processor.  Numba itself looks only at the file that holds a kernel, so it would run a
-stale kernel after a callee in another file was edited.  Hence the rule: a kernel uses nothing from outside this folder
-and the files that its `KernelFolder` names.  Kernels of another folder have a `KernelFolder` of their own, and the same
-rule for that one.
+numba and llvmlite, and the processor.  In it a kernel is a file named by all that was compiled into it (`stamps`).
+Numba itself looks only at the file that holds a kernel, so it would run a stale kernel after a callee in another file
+was edited.  How a function is compiled says the `KernelFolder` that decorates it.
 
 No slice or row is assigned an array, and none is sorted by NumPy's way: to compile what the one says of unlike sizes,
 and the other, takes three seconds in each process.
@@ -31,7 +30,6 @@ own compiler, with its rules for references and indices.
 """
 
 import atexit
-import copy
 import functools
 import hashlib
 import os
@@ -53,28 +51,29 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.typing.templates import AttributeTemplate, make_concrete_template
+from numba.core.typing.templates import AttributeTemplate
 from numpy.typing import NDArray
 
 from factorbus.ownership import make_private
-from factorbus.proto import inertial, kinds
 
 # From beside this file: a copy of them elsewhere is one by itself.
 from . import releases
 from .disk import cache_in
+from .shared import SharedKernel, only_compile
+from .stamps import stamp_of
 
 __all__ = [
     "BOUNDSCHECK",
     "DISABLED",
     "F64",
     "I64",
-    "WIRE_KINDS",
     "AttributeTemplate",
     "KernelFolder",
     "cache_folder",
     "cgutils",
     "code_environment",
     "compile_seconds",
+    "compilers_hash",
     "extending",
     "inline_kernel",
     "intrinsic",
@@ -82,9 +81,9 @@ __all__ = [
     "is_on_disk",
     "iter_compile",
     "kernel",
+    "only_compile",
     "part",
     "shared_kernel",
-    "sources_hash",
     "types",
     "vector_lanes",
 ]
@@ -120,17 +119,14 @@ class KernelFolder:
     family: names the folder of cache folders, of which the last few are kept.  exact: every operation is rounded as it
     is written, none is fused or reordered: the bits depend neither on how a loop is cut up nor on the processor.
     quick: exact, and a call keeps the interpreter lock, because it is done before the lock could be released.
-    also: files outside the folder whose constants or inline kernels its kernels use.
     """
 
-    def __init__(
-        self, sources: Path, family: str, exact: bool = False, quick: bool = False, also: tuple[Path, ...] = ()
-    ) -> None:
-        self._sources, self._family, self._also = sources, family, also
+    def __init__(self, family: str, exact: bool = False, quick: bool = False) -> None:
+        self._family = family
         self._flags = _QUICK_FLAGS if quick else _EXACT_FLAGS if exact else _FLAGS
         self._cache = cache_in(self.path)
         self._path: Path | None = None
-        self._shared: list[_Shared] = []
+        self._shared: list[SharedKernel] = []
 
     def kernel(self, *signatures: Any) -> Any:
         """`@kernel` or `@kernel("int64(float64[::1])", ...)`: see the head of this file."""
@@ -150,16 +146,17 @@ class KernelFolder:
             return function
         return self._linked(function)
 
-    def shared_kernel(self, *signature: Any) -> Any:
-        """`@shared_kernel(types of the arguments)`: compiled once; kernels of this folder call it by its address."""
+    def shared_kernel(self, signature: Any) -> Any:
+        """`@shared_kernel(types.float64(types.int64))`: compiled once; kernels of this folder call it by its address.
+
+        As `kernel` where nothing is called so.
+        """
 
         def made(function: Callable[..., Any]) -> Any:
-            if DISABLED or STOCK:
-                return self.part(function)
             dispatcher = self._compiled(function, (signature,))
-            self._shared.append(
-                _Shared(dispatcher, lambda: f"{self._family} {self.path().name} {function.__qualname__}")
-            )
+            if not (DISABLED or STOCK):
+                name = functools.cache(lambda: f"{self._family} {self.path().name} {function.__qualname__}")
+                self._shared.append(SharedKernel(dispatcher, signature, name, _compile_declared))
             return dispatcher
 
         return made
@@ -178,7 +175,7 @@ class KernelFolder:
             part = functools.cache(lambda: self._linked(function))  # what other kernels link
             dispatcher.get_call_template = lambda args, kws: part().get_call_template(args, kws)
             dispatcher.get_overload = lambda signature: part().get_overload(signature)
-        dispatcher._cache = self._cache(function)
+        dispatcher._cache = self._cache(function, lambda: stamp_of(dispatcher))
         dispatcher.factorbus_signatures = signatures
         if signatures:
             dispatcher._compile_for_args = _on_first_call(dispatcher)
@@ -226,7 +223,7 @@ class KernelFolder:
 
     def _make(self) -> Path:
         base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
-        path = base / self._family / sources_hash(self._sources, *self._also)
+        path = base / self._family / compilers_hash()
         try:
             make_private("the cache of compiled kernels", path)
             tempfile.TemporaryFile(dir=path).close()
@@ -264,17 +261,15 @@ def vector_lanes() -> int:
 
 
 def cache_folder() -> Path:
-    """The folder where kernels of these sources, flags, versions and processor are kept."""
+    """The folder where the solver's kernels for these flags, versions and processor are kept."""
     return _FOLDER.path()
 
 
-def sources_hash(folder: Path, *also: Path) -> str:
-    """The name of the cache folder for kernels whose sources are the Python files in `folder`, those that make
-    kernels, and `also`."""
+@functools.cache
+def compilers_hash() -> str:
+    """The name of a cache folder: how kernels are compiled, the files beside this one, and for what."""
     digest = hashlib.sha256()
-    here = Path(__file__)
-    makers = (here, *map(here.with_name, ("disk.py", "lowering.py", "releases.py")))
-    for path in sorted({*folder.rglob("*.py"), *makers, *also}, key=lambda path: (path.parent.name, path.name)):
+    for path in sorted(Path(__file__).parent.glob("*.py")):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
     digest.update(repr((sys.version, sorted(code_environment().items()), sorted(_FASTMATH), STOCK)).encode())
@@ -324,38 +319,6 @@ def _common(kind: Any) -> Any:
     return types.intp if is_zero else types.boolean if isinstance(kind, types.BooleanLiteral) else kind
 
 
-class _Shared:
-    """A kernel that others call by its address, which this process knows by the name that is in their code."""
-
-    def __init__(self, dispatcher: Any, name: Callable[[], str]) -> None:
-        self._dispatcher, self._name, self._called_by = dispatcher, name, object()
-        self._template: Any = None
-        self._begun = False
-        dispatcher.get_call_template = lambda args, _kws: (self._found(), None, tuple(args), {})
-        dispatcher.get_overload = lambda _signature: self._called_by
-
-    @property
-    def is_being_made(self) -> bool:
-        return self._begun and self._template is None
-
-    def provide(self) -> None:
-        """The name stands for the machine code, which is compiled, or loaded, where it is not there yet."""
-        if self._begun:
-            return
-        self._begun = True
-        _compile_declared(self._dispatcher)
-        (result,) = self._dispatcher.overloads.values()
-        name, described = self._name(), copy.copy(result.fndesc)
-        llvmlite.binding.add_symbol(name, result.library.get_pointer_to_function(described.mangled_name))
-        described.mangled_name = name
-        self._dispatcher.targetctx.insert_user_function(self._called_by, described)
-        self._template = make_concrete_template(name, key=name, signatures=[result.signature])
-
-    def _found(self) -> Any:
-        self.provide()
-        return self._template
-
-
 class _Compilations(event.TimingListener):
     """Adds up the time of the outermost compilations of our kernels; the compiler lock makes them sequential."""
 
@@ -387,9 +350,6 @@ def _prune(base: Path, keep: Path) -> None:
 _COMPILATIONS = _Compilations()
 event.register("numba:compile", _COMPILATIONS)
 
-_KERNELS = Path(__file__).parents[1]
-_LENSES = _KERNELS.with_name("lenses")
-WIRE_KINDS = Path(kinds.__file__), Path(inertial.__file__)  # kernels have their names and sizes as constants
-_FOLDER = KernelFolder(_KERNELS, "kernels", also=(*_LENSES.glob("*.py"), *WIRE_KINDS))
+_FOLDER = KernelFolder("kernels")
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part
 shared_kernel = _FOLDER.shared_kernel

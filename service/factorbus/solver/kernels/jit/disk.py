@@ -1,11 +1,16 @@
-"""Compiled kernels on disk: Numba's cache, in a folder of our choice and in files that nobody else can have written."""
+"""Compiled kernels on disk: Numba's cache, in a folder of our choice and in files that nobody else can have written.
+
+A file has the stamp of its kernel in its name (`stamps`).  Of each kernel the last few stay, by when they were used.
+"""
 
 import contextlib
+import glob
 import hashlib
 import os
 import pickle
 import secrets
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,11 +20,13 @@ from factorbus.ownership import check_file
 
 __all__ = ["cache_in"]
 
+_KEPT = 6  # of one kernel
 
-def cache_in(folder: Callable[[], Path]) -> type[caching.FunctionCache]:
-    """Numba's cache of a function, in a folder that is made when it is first asked for.
 
-    The folder's name stands for the sources: nothing else is stamped.
+def cache_in(folder: Callable[[], Path]) -> Callable[[Callable[..., Any], Callable[[], str]], Any]:
+    """Numba's cache of a function, in a folder that is made when it is first asked for: (function, its stamp).
+
+    The stamp is first asked for when a kernel is loaded or kept: what it names may come after it in its file.
     """
 
     class Locator(caching._CacheLocator):
@@ -45,11 +52,17 @@ def cache_in(folder: Callable[[], Path]) -> type[caching.FunctionCache]:
     class Cache(caching.FunctionCache):
         _impl_class = Content
 
-        def __init__(self, function: Callable[..., Any]) -> None:
+        def __init__(self, function: Callable[..., Any], stamp: Callable[[], str]) -> None:
             super().__init__(function)
-            # As numba makes it, but for how files are opened.
+            self._stamp = stamp
+            del self._cache_file  # until it is asked for
+
+        @cached_property
+        def _cache_file(self) -> caching.IndexDataCacheFile:
+            """As Numba makes it, but for its name and for how files are opened."""
             content = self._impl
-            self._cache_file = _OwnFiles(self._cache_path, content.filename_base, content.locator.get_source_stamp())
+            name = f"{content.filename_base}-{self._stamp()}"
+            return _OwnFiles(self._cache_path, name, content.locator.get_source_stamp())
 
     return Cache
 
@@ -61,10 +74,24 @@ class _OwnFiles(caching.IndexDataCacheFile):
     place in between.
     """
 
+    def save(self, key: Any, data: Any) -> None:
+        super().save(key, data)
+        self._drop_others()
+
+    def _drop_others(self) -> None:
+        """All but the versions of this function that were used last."""
+        name, _, _ = self._index_name.rpartition("-")
+        versions = [(path.stat().st_mtime, path) for path in Path(self._cache_path).glob(f"{glob.escape(name)}-*.nbi")]
+        for _, path in sorted(versions)[:-_KEPT]:
+            for one in (path, *path.parent.glob(f"{glob.escape(path.stem)}.*.nbc")):
+                one.unlink(missing_ok=True)
+
     def _load_index(self) -> dict[Any, str]:
         try:
             with _opened(self._index_path) as file:
                 version, data = pickle.load(file), file.read()
+            with contextlib.suppress(OSError):  # a folder that is only read
+                os.utime(self._index_path)
         except FileNotFoundError:
             return {}
         if version != self._version:

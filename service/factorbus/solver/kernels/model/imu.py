@@ -17,7 +17,7 @@ import numpy as np
 
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.model.composed import FIRST, INNER, SCRATCH, SECOND, carry_over, put_sensor
+from factorbus.solver.kernels.model.composed import FIRST, INNER, SCRATCH, SECOND, carry_over, copy_pose, put_sensor
 from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.imu_noise import SIZE
 from factorbus.solver.kernels.model.preintegration import (
@@ -86,9 +86,9 @@ def gravity_of(form: ImuLayout, x: F64, places: I64, z: F64) -> F64:
 def put_mount(form: ImuLayout, x: F64, places: I64, z: F64, y: F64) -> bool:
     """m to y[INNER]; False: the IMU is where the pose is."""
     if form.mount >= 0:
-        y[INNER : INNER + of.MOUNT] = x[places[form.mount] : places[form.mount] + of.MOUNT]
+        copy_pose(False, x, places[form.mount], y, INNER)
         return True
-    y[INNER : INNER + of.MOUNT] = z[form.mount_at : form.mount_at + of.MOUNT]
+    copy_pose(False, z, form.mount_at, y, INNER)
     is_mounted = y[INNER + 6] != 1.0
     for c in range(6):
         is_mounted |= y[INNER + c] != 0.0

@@ -338,7 +338,7 @@ _FLOATS, _ROWS = types.float64[::1], types.float64[:, ::1]
 _ENDS = types.NamedUniTuple(types.int64, 2, Ends)
 
 
-@shared_kernel(types.int64, _FLOATS, _ENDS, _FLOATS, types.int64, _FLOATS, _ROWS, _ROWS)
+@shared_kernel(types.float64(types.int64, _FLOATS, _ENDS, _FLOATS, types.int64, _FLOATS, _ROWS, _ROWS))
 def residual_of(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F64, B: F64) -> float:
     """The residual function of a kind; gives what χ² has beside rᵀ Ω r."""
     return _residual_of(kind, x, ends, p, k, r, A, B)

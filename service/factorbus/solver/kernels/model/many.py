@@ -30,8 +30,6 @@ from factorbus.solver.kernels.model.losses import loss_of
 from factorbus.solver.kernels.model.similarity import similar
 from factorbus.solver.kernels.model.sizes import dim_of
 
-_FLOATS, _ROWS = types.float64[::1], types.int64[:, ::1]
-
 
 class Many(NamedTuple):
     """A factor linearized: r (dim or R_SIZE,), J (dim, Σ d); start (ends + 1,): the first column of each variable."""
@@ -41,25 +39,12 @@ class Many(NamedTuple):
     start: I64
 
 
-@inline_kernel
-def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
-    """The factor that begins at row f at the values x, whitened and with its loss; what χ² has beside rᵀ r."""
-    return linearize_kept(f, var, fac, x, payload, payload[:0])
+_FLOATS, _ROWS = types.float64[::1], types.int64[:, ::1]
+_MANY = types.NamedTuple((_FLOATS, types.float64[:, ::1], types.int64[::1]), Many)
+_LINEARIZED = types.Tuple((types.float64, _MANY))(types.int64, _ROWS, _ROWS, _FLOATS, _FLOATS, _FLOATS)
 
 
-@shared_kernel(types.int64, _ROWS, _ROWS, _FLOATS, _FLOATS, _FLOATS)
-def linearize_kept(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) -> tuple[float, Many]:
-    """The same, of an inertial factor by what is in `kept`, see `imu`."""
-    more, many = evaluate_plain(f, var, fac, x, payload, kept)
-    dim, start = len(many.J), information_start(f, var, fac, payload)
-    whiten_in_place(dim, start, payload, many)
-    loss = loss_code(f, fac)
-    if loss != at.NO_LOSS:
-        more = soften_many(loss, payload[start + dim * (dim + 1) // 2], more, many)
-    return more, many
-
-
-@part
+@shared_kernel(_LINEARIZED)
 def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) -> tuple[float, Many]:
     """Residual and Jacobians of the factor that begins at row f; what χ² has beside rᵀ Ω r."""
     kind, ends, dim, more = fac[f, at.F_KIND], count_ends(f, fac), residual_size(f, fac), 0.0
@@ -83,6 +68,24 @@ def evaluate_plain(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) 
         similar(kind, x, places, payload, fac[f, at.F_AT], many.r, many.J)
     else:
         more = composed(kind, x, places, payload, fac[f, at.F_AT], many.r, many.J, start)
+    return more, many
+
+
+@inline_kernel
+def linearize_many(f: int, var: I64, fac: I64, x: F64, payload: F64) -> tuple[float, Many]:
+    """The factor that begins at row f at the values x, whitened and with its loss; what χ² has beside rᵀ r."""
+    return linearize_kept(f, var, fac, x, payload, payload[:0])
+
+
+@shared_kernel(_LINEARIZED)
+def linearize_kept(f: int, var: I64, fac: I64, x: F64, payload: F64, kept: F64) -> tuple[float, Many]:
+    """The same, of an inertial factor by what is in `kept`, see `imu`."""
+    more, many = evaluate_plain(f, var, fac, x, payload, kept)
+    dim, start = len(many.J), information_start(f, var, fac, payload)
+    whiten_in_place(dim, start, payload, many)
+    loss = loss_code(f, fac)
+    if loss != at.NO_LOSS:
+        more = soften_many(loss, payload[start + dim * (dim + 1) // 2], more, many)
     return more, many
 
 

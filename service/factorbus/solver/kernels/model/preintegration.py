@@ -95,13 +95,28 @@ def preintegrate(form: ImuLayout, z: F64, bias: F64, room: F64, jacobians: bool)
     """
     if has_bits_of(bias, room):
         return
-    delta, scratch, total, kept = nothing_yet(), scratch_of_sample(), 0.0, preintegrated_in(room)
+    delta, scratch, total = nothing_yet(), scratch_of_sample(), 0.0
     for n in range(form.samples):
         add_sample(z, form.start + of.SAMPLE * n, bias, delta, scratch, jacobians)
         total += z[form.start + of.SAMPLE * n]
-    room[: of.BIAS], room[ROOM_T] = bias, total
-    kept.q[:], kept.p[:], kept.v[:] = delta.q, delta.p, delta.v
-    kept.R_b[:], kept.p_b[:], kept.v_b[:] = delta.R_b, delta.p_b, delta.v_b
+    room[ROOM_T] = total
+    for c in range(of.BIAS):
+        room[c] = bias[c]
+    keep(delta, room)
+
+
+@inline_kernel
+def keep(delta: Preintegrated, room: F64) -> None:
+    """Δ into an array that has room for it."""
+    q, p, v, R_b, p_b, v_b = preintegrated_in(room)
+    for c in range(4):
+        q[c] = delta.q[c]
+    for a in range(3):
+        p[a], v[a] = delta.p[a], delta.v[a]
+        for c in range(3):
+            R_b[a, c] = delta.R_b[a, c]
+        for c in range(6):
+            p_b[a, c], v_b[a, c] = delta.p_b[a, c], delta.v_b[a, c]
 
 
 @inline_kernel
@@ -119,8 +134,10 @@ def correct_to_first_order(form: ImuLayout, z: F64, bias: F64, room: F64) -> Non
 
     ΔR := ΔR exp(J_R δ_g),  J_R := Jr(J_R δ_g) J_R,  Δp += J_p δ,  Δv += J_v δ,  δ the bias less that of the measurement
     """
-    room[: of.BIAS] = bias
-    room[of.BIAS :] = z[form.start : form.start + of.DELTA]
+    for c in range(of.BIAS):
+        room[c] = bias[c]
+    for c in range(of.DELTA):
+        room[of.BIAS + c] = z[form.start + c]
     q, p, v, R_b, p_b, v_b = preintegrated_in(room)
     turn, Jr, k = np.zeros(3), np.empty((3, 3)), form.bias_at
     for a in range(3):
