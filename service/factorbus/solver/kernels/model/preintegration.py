@@ -49,6 +49,8 @@ class SampleTerms(NamedTuple):
 
 # Δ in an array: the bias it was integrated at, T, and what `Preintegrated` has, each row by row.
 ROOM_T = of.BIAS
+ROOM_Q, ROOM_P, ROOM_V, ROOM_R_B = ROOM_T + 1, ROOM_T + 5, ROOM_T + 8, ROOM_T + 11
+ROOM_P_B, ROOM_V_B = ROOM_R_B + 9, ROOM_R_B + 27
 ROOM = of.BIAS + of.DELTA
 
 
@@ -99,7 +101,7 @@ def preintegrate(form: ImuLayout, z: F64, bias: F64, room: F64, jacobians: bool)
     for n in range(form.samples):
         add_sample(z, form.start + of.SAMPLE * n, bias, delta, scratch, jacobians)
         total += z[form.start + of.SAMPLE * n]
-    room[: of.BIAS], room[ROOM_T] = bias, total
+    room[: of.BIAS], room[ROOM_T] = bias[: of.BIAS], total
     kept.q[:], kept.p[:], kept.v[:] = delta.q, delta.p, delta.v
     kept.R_b[:], kept.p_b[:], kept.v_b[:] = delta.R_b, delta.p_b, delta.v_b
 
