@@ -24,7 +24,10 @@ SAMPLE = 7  # of a sample: its duration, gyroscopes, accelerometers
 # Of Δ: T, ΔR (qx qy qz qw), Δp, Δv; the derivatives of ΔR's right increment by gyroscopes, of Δp and of Δv by the bias.
 DELTA = 1 + 4 + 3 + 3 + 9 + 18 + 18
 MOST_SAMPLES = 2000
-KEPT = 45  # numbers that a solver keeps behind samples: what whitens nine of the residual
+# What a solver keeps behind samples: what whitens nine of the residual; Δ where noise is propagated, what its 45
+# derivatives change by with each gyroscope's bias, and how far the velocity changes on the way.
+ROOT = 45
+KEPT = ROOT + DELTA + 3 * 45 + 1
 RESIDUAL = 15  # rotation, position, velocity, bias
 
 PREFIX = "imu_"

@@ -6,16 +6,17 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import has_free
 from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, shift_error_weight
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_isotropic
+from factorbus.solver.kernels.bayes_tree.hessian_of_many import write_hessian_rows
 from factorbus.solver.kernels.bayes_tree.hessian_room import hessian_size, keep_jacobian, kept_samples
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import Panel, put, six, zero
+from factorbus.solver.kernels.jit.simd import Panel, put, six
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, row_of_pair
+from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, multiply
-from factorbus.solver.kernels.model.many import Many, linearize_kept, square_of, width_of
+from factorbus.solver.kernels.model.many import linearize_kept, square_of, width_of
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
@@ -56,57 +57,19 @@ def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None
 
 @part
 def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
-    """The Hessians of all rows of the factor that begins at row f.
-
-    The rows (0, 1), …, (0, n−1) have the diagonal block and the gradient of their second variable, the first row those
-    of the first one and χ² too; what else there is room for is zero.  So the sum of the rows is the factor.
-    """
+    """The Hessians of all rows of the factor that begins at row f, and what is kept of its Jacobian."""
     var, fac, out, link, state, totals = graph.var, graph.fac, tree.hessian, tree.link, tree.state, tree.totals
     more, many = linearize_kept(f, var, fac, tree.lin[0], graph.payload, kept_samples(f, var, fac, tree))
-    ends, last = many.start.size - 1, link[f, tl.L_AT] + hessian_size(width_of(0, many), width_of(1, many)) - 1
-    was = load(out, last)
-    for n in range(max(ends - 1, 1)):
-        for m in range(n + 1, max(ends, 2)):
-            row = row_of_pair(f, n, m, ends)
-            h, di, dj = link[row, tl.L_AT], width_of(n, many), width_of(m, many)
-            _block_of(n == 0 and m == 1, many, n, n, h, out)
-            _block_of(m < ends, many, n, m, h + di * di, out)
-            _block_of(n == 0 and m < ends, many, m, m, h + di * di + di * dj, out)
-            g = h + di * di + di * dj + dj * dj
-            _gradient_of(n == 0 and m == 1, many, n, g, out)
-            _gradient_of(n == 0 and m < ends, many, m, g + di, out)
-            put(out, g + di + dj, 0.0)
+    last = link[f, tl.L_AT] + hessian_size(width_of(0, many), width_of(1, many)) - 1
+    was, chi2 = load(out, last), more + square_of(many)
+    write_hessian_rows(f, many, chi2, link, out)
     keep_jacobian(f, graph, tree, many)
-    chi2 = more + square_of(many)
-    put(out, last, chi2)
     if f < state[tl.S_TAKEN] and not has_free(f, var, fac):
         # No clique takes the first row in: its χ² is among the constants.
         totals[tl.T_CONSTANT] += chi2 - was
         totals[tl.T_MODEL] += chi2 - was
     if is_camera(fac[f, at.F_KIND]):
         note_inactive(f, many.r[at.R_STATUS] != GOOD, link, state)
-
-
-@inline_kernel
-def _block_of(has: bool, many: Many, n: int, m: int, h: int, out: F64) -> None:
-    """J_nᵀ J_m, row by row, from h on; zeros where it is elsewhere."""
-    start, d, e = many.start, width_of(n, many), width_of(m, many)
-    zero(out, h, d * e)
-    for a in range(len(many.J) if has else 0):
-        for i in range(d):
-            left = many.J[a, start[n] + i]
-            for j in range(e if left != 0.0 else 0):
-                put(out, h + i * e + j, load(out, h + i * e + j) + left * many.J[a, start[m] + j])
-
-
-@inline_kernel
-def _gradient_of(has: bool, many: Many, n: int, g: int, out: F64) -> None:
-    """−J_nᵀ r from g on; zeros where it is elsewhere."""
-    for i in range(width_of(n, many)):
-        total = 0.0
-        for a in range(len(many.J) if has else 0):
-            total += many.J[a, many.start[n] + i] * many.r[a]
-        put(out, g + i, -total)
 
 
 @inline_kernel

@@ -18,6 +18,7 @@ from factorbus.solver.kernels.model.bounds import (
     are_within,
 )
 from factorbus.solver.kernels.model.expression_layout import X_BEFORE, X_QUATERNION, X_WIDTH
+from factorbus.solver.kernels.model.imu_expansion import write_expansion
 from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.imu_noise import write_root
 from factorbus.solver.kernels.model.kinds import direction_at, positive_at, quaternion_at
@@ -79,7 +80,8 @@ def check_own_measurement(p: int, payload: F64) -> int:
 
 @part
 def check_imu(form: ImuLayout, p: int, payload: F64) -> int:
-    """What is wrong with a new inertial measurement of that form, which starts at p; W is written behind samples."""
+    """What is wrong with a new inertial measurement of that form, which starts at p; what is kept of samples is
+    written behind them."""
     size = form.start + (inertial.SAMPLE * form.samples if form.samples > 0 else inertial.DELTA)
     if not are_within(MOST_NUMBER, p, size, payload):
         return gt.OUT_OF_BOUNDS
@@ -97,8 +99,10 @@ def check_imu(form: ImuLayout, p: int, payload: F64) -> int:
     for k in range(p + form.start, p + size, inertial.SAMPLE):
         if not payload[k] > 0.0:
             return gt.BAD_DURATION
-    is_certain = not write_root(form, payload[p:], size, payload[p:])
-    return gt.BAD_NOISE if is_certain or not are_within(MOST_LINEAR, p + size, inertial.KEPT, payload) else gt.GOOD
+    if not write_root(form, payload[p:], size, payload[p:]):
+        return gt.BAD_NOISE
+    write_expansion(form, payload[p:])
+    return gt.GOOD if are_within(MOST_LINEAR, p + size, inertial.ROOT, payload) else gt.BAD_NOISE
 
 
 @part

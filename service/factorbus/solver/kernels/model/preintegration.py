@@ -49,6 +49,8 @@ class SampleTerms(NamedTuple):
 
 # Δ in an array: the bias it was integrated at, T, and what `Preintegrated` has, each row by row.
 ROOM_T = of.BIAS
+ROOM_Q, ROOM_P, ROOM_V, ROOM_R_B = ROOM_T + 1, ROOM_T + 5, ROOM_T + 8, ROOM_T + 11
+ROOM_P_B, ROOM_V_B = ROOM_R_B + 9, ROOM_R_B + 27
 ROOM = of.BIAS + of.DELTA
 
 
