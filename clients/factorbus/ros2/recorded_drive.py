@@ -17,7 +17,7 @@ from factorbus.ros2.recording import RecordedTopic, RobotRecording
 from factorbus.ros2.settings import Settings
 from factorbus.wording import counted
 
-_STATIC = "/tf_static"
+_STATIC = "tf_static"
 _SHOWN = 8  # topics in a message
 
 
@@ -121,6 +121,8 @@ class _Reading:
         return left + [f"{topic}: {remark} ({counted(n, 'time')})" for (topic, remark), n in self._remarks.items()]
 
     def _take(self, topic: str, read: Any) -> Any:
+        if read.header.stamp.sec == read.header.stamp.nanosec == 0:
+            raise BadRosMessage(topic, "a stamp of 0, as of a driver that sets none", "the time of the measurement")
         if topic == self._settings.odometry:
             return self._front_end.odometry(read)
         if topic in self._settings.poses:
@@ -134,22 +136,57 @@ class _Reading:
 
 def _with_topics(recording: RobotRecording, settings: Settings) -> tuple[Settings, list[str]]:
     """The topics to read, those not named by their types, and what was chosen.  Raises BadRecording."""
-    topics = {topic.name: topic for topic in recording.topics}
-    named = [*([settings.odometry] if settings.odometry else []), *settings.poses, *settings.landmarks]
-    for name in named:
-        if name not in topics:
-            raise BadRecording(recording.path, f"no topic {name}", f"one of {_listed(recording.topics)}")
+    _check_named(recording, ODOMETRY, [settings.odometry] if settings.odometry else [])
+    _check_named(recording, POSE, settings.poses)
+    _check_named(recording, DETECTIONS, settings.landmarks)
     notes = []
     if not settings.odometry:
         settings, note = _with_odometry(recording, settings)
         notes.append(note)
     if not settings.landmarks and (found := _of_type(recording, DETECTIONS)):
+        found, others = _of_this_robot(recording, settings, found)
         settings = replace(settings, landmarks=tuple(topic.name for topic in found))
-        notes.append(f"landmarks: {_listed(found)}")
+        if found:
+            notes.append(f"landmarks: {_listed(found)}")
+        if others:
+            takes = " ".join(f"--landmarks {topic.name}" for topic in others)
+            notes.append(f"landmarks of another robot left out: {_listed(others)}; {takes} takes them")
     if not settings.poses and (found := _of_type(recording, POSE)):
         takes = " ".join(f"--pose {topic.name}" for topic in found)
         notes.append(f"poses left out: {_listed(found)}; {takes} takes them, and --start pose begins with the first")
     return settings, notes
+
+
+def _check_named(recording: RobotRecording, type_name: str, names: Sequence[str]) -> None:
+    """Raises BadRecording: a topic that was named is not there, or has messages of another type."""
+    topics = {topic.name: topic.type_name for topic in recording.topics}
+    for name in names:
+        if name not in topics:
+            raise BadRecording(recording.path, f"no topic {name}", f"one of {_listed(recording.topics)}")
+        if topics[name] != type_name:
+            there = _listed(_of_type(recording, type_name)) or "none"
+            wanted = f"a topic of {type_name} (there is {there})"
+            raise BadRecording(recording.path, f"{name} is of {topics[name]}", wanted)
+
+
+def _of_this_robot(
+    recording: RobotRecording, settings: Settings, found: Sequence[RecordedTopic]
+) -> tuple[list[RecordedTopic], list[RecordedTopic]]:
+    """(topics of the robot whose odometry is read, those of others).
+
+    Robots are told apart by the first part of names, where each has an odometry that is called the same behind it.
+    """
+    mine, name = _namespaced(settings.odometry)
+    robots = {_namespaced(topic.name)[0] for topic in _of_type(recording, ODOMETRY) if topic.name.endswith(f"/{name}")}
+    others = robots - {mine} if mine else set[str]()
+    theirs = [topic for topic in found if _namespaced(topic.name)[0] in others]
+    return [topic for topic in found if topic not in theirs], theirs
+
+
+def _namespaced(topic: str) -> tuple[str, str]:
+    """("/robot1", "odom") of /robot1/odom; ("", "odom") of /odom."""
+    first, _, rest = topic.removeprefix("/").partition("/")
+    return (f"/{first}", rest) if rest else ("", first)
 
 
 def _with_odometry(recording: RobotRecording, settings: Settings) -> tuple[Settings, str]:
@@ -173,9 +210,10 @@ def _listed(topics: Sequence[RecordedTopic]) -> str:
 
 
 def _mounts(recording: RobotRecording, settings: Settings) -> dict[str, Transform]:
-    """T_base_frame of all frames that /tf_static joins to the base frame of odometry."""
+    """T_base_frame of all frames that a tf_static, that of all or the robot's own, joins to odometry's base frame."""
     edges: dict[str, dict[str, Transform]] = {}
-    statics = [topic.name for topic in recording.topics if topic.name == _STATIC and topic.type_name == TRANSFORMS]
+    of_robot = (f"/{_STATIC}", f"{_namespaced(settings.odometry)[0]}/{_STATIC}")
+    statics = [topic.name for topic in _of_type(recording, TRANSFORMS) if topic.name in of_robot]
     for message in recording.messages(statics) if statics else ():
         try:
             transforms = recording.read(message).transforms

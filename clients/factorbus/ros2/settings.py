@@ -9,6 +9,7 @@ from factorbus.ros2.options import BridgeOptions, RobotOptions
 from factorbus.ros2.problems import BadRosName
 
 USUAL_POSES, USUAL_LANDMARKS = ("/initialpose",), ("/detections",)
+LANDMARK_LETTER = "l"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ class Settings:
     map_frame: str = "map"
     space: str = "plane"
     letter: str = "x"
-    landmark_letter: str = "l"
+    landmark_letter: str = LANDMARK_LETTER
     start: str = "odometry"
     keyframe_m: float = 0.5
     keyframe_rad: float = 0.35
@@ -76,6 +77,8 @@ def bridge_settings(options: BridgeOptions) -> Settings:
 def robot_settings(options: RobotOptions) -> Settings:
     """Of a robot, with the topics that were given and no others.  Raises BadRosName, BadSymbol."""
     symbol(options.letter, 0)
+    if options.letter == LANDMARK_LETTER:
+        raise BadRosName("the letter", options.letter, "another one: this is that of landmarks")
     return Settings(
         odometry=options.odom,
         poses=tuple(options.poses),
