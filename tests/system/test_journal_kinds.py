@@ -83,7 +83,7 @@ def told(driven: Map) -> tuple[Any, ...]:
         for group in graph.factors
     ]
     asked = [driven.uncertainty.joint(key).tobytes() for key in ("x3", "v3", "b3", "r3", "s3", "c0", "c1", "c2", "m0")]
-    return rows(estimate.variables), factors, asked, driven.chi2().value
+    return rows(estimate.variables), factors, asked, driven.chi2().chi2
 
 
 def drive(driven: Map) -> None:

@@ -6,6 +6,7 @@ where there were too many samples between.  A front end does not know the future
 f0: fixes wait until the robot has moved `_FAR` times as far as they are uncertain, and enter with f0.
 """
 
+import warnings
 from collections.abc import Sequence
 from typing import overload
 
@@ -16,7 +17,7 @@ from factorbus.cli.logs.start import Start, course, started
 from factorbus.client.draft import Draft
 from factorbus.client.frames import compose, inverse
 from factorbus.client.imu import cut_samples
-from factorbus.client.imu_samples import GAP, implausible_units
+from factorbus.client.imu_samples import GAP, ImplausibleSamples, implausible_units
 from factorbus.formats import FormatError
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Variables
@@ -38,7 +39,9 @@ class LogSteps(Sequence[Batch]):
         self._framed = log.fixes is not None and log.way is not None and log.way.relative
         self._frame, self._frame_step = self._aligned() if self._framed else (None, 0)
         self._last_way: tuple[int, int] | None = None
-        self._batches = [self._step(n) for n in range(len(self.times))]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ImplausibleSamples)  # once for the whole log, in its notes
+            self._batches = [self._step(n) for n in range(len(self.times))]
 
     @property
     def poses(self) -> int:
