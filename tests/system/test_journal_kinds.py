@@ -51,12 +51,12 @@ def step(n: int, chance: np.random.Generator) -> Draft:
     """A moment more, with something of every kind."""
     at = {what: (f"{what}{n - 1}", f"{what}{n}") for what in "xvbrs"}
     draft = Draft().se3(at["x"][1]).vector(at["v"][1], size=3).vector(at["b"][1], size=6)
-    moments = tuple((at["x"][k], at["v"][k], at["b"][k]) for k in (0, 1))
+    before, here = ((at["x"][k], at["v"][k], at["b"][k]) for k in (0, 1))
     samples = SAMPLES + np.append(0, chance.normal(0, 0.02, 6))
     if n % 2:
-        draft.imu(*moments, samples, noise=NOISE, gravity="g0", mount="m0")
+        draft.imu(before, here, samples, noise=NOISE, gravity="g0", mount="m0")
     else:
-        draft.imu_preintegrated(*moments, preintegrate_samples(samples, NOISE), gravity="g0")
+        draft.imu_preintegrated(before, here, preintegrate_samples(samples, NOISE), gravity="g0")
     draft.position_se3(at["x"][1], chance.normal(0, 0.1, 3), sigmas=[0.1] * 3)
     turn, way = np.append(chance.normal(0, 0.1, 3), 1.0), np.append(chance.normal(0, 0.1, 6), 1.0)
     draft.so3(at["r"][1]).between_so3(*at["r"], turn / np.linalg.norm(turn), sigmas=[0.1] * 3)
@@ -95,7 +95,8 @@ def drive(driven: Map) -> None:
     late = Draft().so3("r99", NO_TURN).prior_so3("r99", NO_TURN, sigmas=[0.1] * 3)
     late.sim3("s99", (*STILL, 2)).prior_sim3("s99", (*STILL, 2), sigmas=[0.1] * 7)
     driven.change(Changes().undo(late, driven.insert(late)))
-    of_kind = {group.kind: group.ids.tolist() for group in driven.graph().batch.factors}
+    groups = driven.graph().batch.factors
+    of_kind = {group.kind: group.ids.tolist() for group in groups if group.ids is not None}
     driven.change(Changes().loss(of_kind["between_so3"][4], "cauchy", 1.0).weigh(of_kind["between_sim3"][4], 0.5))
     driven.change(Changes().marginalize("s8", "r8", "v1"))
     driven.change(Changes().fix("c0", "w0"))
