@@ -118,12 +118,12 @@ def test_every_kind_of_variable_is_there_to_the_bit_after_a_kill(
         assert symbol("r", 99) not in before[0]
     for _ in range(2):  # from its records, and once more from whatever it wrote of them
         running.end(signal.SIGKILL)
-        with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("kinds") as driven:
+        with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("kinds", mode) as driven:
             assert told(driven) == before
     running.end(signal.SIGTERM)
     export_map(journal / "kinds", tmp_path / "kinds.fbmap")
     import_map(tmp_path / "kinds.fbmap", journal / "other")
-    with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("other") as driven:
+    with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("other", mode) as driven:
         assert told(driven) == before
         again = Draft().so3("r9").between_so3("r7", "r9", NO_TURN, sigmas=[0.1] * 3)
         assert driven.insert(again).report["chi2"] >= 0
