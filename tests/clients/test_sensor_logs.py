@@ -1,6 +1,7 @@
 """Logs of an IMU with GNSS, odometry or poses: what `simulate inertial` writes `replay` finds out; EuRoC, KITTI."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -227,7 +228,7 @@ def test_a_folder_that_is_no_log_or_has_an_imu_alone_is_refused(
     drive: tuple[Path, InertialWorld], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["replay", str(tmp_path), "--in-process"]) == BAD_FILE
-    assert "a folder without a log that is known" in capsys.readouterr().err
+    assert "a folder without a log or a recording that is known" in capsys.readouterr().err
     _copied(drive[0] / "mav0" / "imu0", tmp_path / "imu0")
     with pytest.raises(FormatError, match="an IMU alone drifts away"):
         read_log(tmp_path)
@@ -243,3 +244,67 @@ def test_inertial_is_a_folder_and_the_others_are_files(tmp_path: Path, capsys: p
     assert main(["simulate", "inertial", "--poses", "10", "--folder", str(tmp_path / "a")]) == OK
     assert "truth.json" in capsys.readouterr().err
     assert len(json.loads((tmp_path / "a" / "truth.json").read_text())["mount"]) == 7
+
+
+def edited(drive: tuple[Path, InertialWorld], folder: Path, file: str, edit: Callable[[str], str]) -> Path:
+    """A copy of a drive, of which one file reads otherwise."""
+    shutil.copytree(drive[0], folder)
+    path = folder / "mav0" / file
+    path.write_text(edit(path.read_text()))
+    return folder
+
+
+MOUNTED = "T_BS: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0.25], [0, 0, 0, 1]]\n"
+
+
+@pytest.mark.parametrize(
+    "text", [MOUNTED, MOUNTED.replace("[[", "\n  - [").replace("], [", "]\n  - [").replace("]]", "]")]
+)
+def test_a_mount_may_be_written_row_by_row(drive: tuple[Path, InertialWorld], tmp_path: Path, text: str) -> None:
+    log = read_log(edited(drive, tmp_path / "rows", "gps0/sensor.yaml", lambda _: text))
+    assert log.fixes is not None
+    np.testing.assert_allclose(log.fixes.lever, [0.5, 0, 0.25])
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "found"),
+    [
+        ("gps0/sensor.yaml", "origin: [48.1N, 11.6E, 520]\n", "48.1N"),
+        ("gps0/sensor.yaml", "T_BS: the middle\n", "numbers of T_BS|numbers .of T_BS"),
+        ("gps0/sensor.yaml", "T_BS:\n", "T_BS without a number"),
+        ("odom0/sensor.yaml", "sigma_position: [0.02, 0.02, 0.02]\n", "sigma_position"),
+        ("odom0/sensor.yaml", "sigma_angle: -1\n", "sigma_angle"),
+        ("imu0/sensor.yaml", MOUNTED, "poses are those of the IMU"),
+        ("imu0/sensor.yaml", "gyroscope_noise_density: small\n", "gyroscope_noise_density"),
+    ],
+)
+def test_what_a_sensor_yaml_says_is_used_or_refused(
+    drive: tuple[Path, InertialWorld], tmp_path: Path, file: str, text: str, found: str
+) -> None:
+    folder = edited(drive, tmp_path / "edited", file, lambda _: text)
+    with pytest.raises(FormatError, match=found) as refused:
+        read_log(folder)
+    assert "sensor.yaml" in str(refused.value)
+
+
+def test_where_samples_were_lost_the_map_goes_on(drive: tuple[Path, InertialWorld], tmp_path: Path) -> None:
+    def lose(text: str) -> str:
+        lines = text.splitlines()
+        return "\n".join(lines[:700] + lines[1000:])
+
+    folder = edited(drive, tmp_path / "lost", "imu0/data.csv", lose)
+    assert any("1 gap" in note for note in read_log(folder).notes)
+    assert len(poses_of(driven(folder))) > 80
+
+
+def test_units_that_cannot_be_are_said(drive: tuple[Path, InertialWorld], tmp_path: Path) -> None:
+    def in_g(text: str) -> str:
+        first, *lines = text.splitlines()
+        rows = [line.split(",") for line in lines]
+        return "\n".join(
+            [first, *(",".join([*row[:4], *(str(float(cell) / 9.80665) for cell in row[4:])]) for row in rows)]
+        )
+
+    assert not any("IMU:" in note for note in read_log(drive[0]).notes)
+    (note,) = [note for note in read_log(edited(drive, tmp_path / "g", "imu0/data.csv", in_g)).notes if "IMU:" in note]
+    assert "is it in g?" in note

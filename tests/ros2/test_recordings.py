@@ -3,12 +3,14 @@
 import json
 import math
 import random
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import recordings
+import ros
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import StoragePlugin
 
@@ -261,3 +263,68 @@ def test_bytes_that_are_no_message_are_counted(drive: recordings.Drive, tmp_path
     made = read_recording(recordings.write_mcap(tmp_path / "bytes.mcap", said), FOUND)
     assert made.left_out == {"/odom": 1}
     assert made.steps.poses == 45
+
+
+@pytest.mark.parametrize(
+    ("settings", "found"),
+    [
+        (replace(FOUND, odometry="/detections"), "/detections is of vision_msgs/msg/Detection3DArray"),
+        (replace(FOUND, poses=("/odom",)), "/odom is of nav_msgs/msg/Odometry"),
+        (replace(FOUND, landmarks=("/odom",)), "there is /detections"),
+    ],
+)
+def test_a_topic_of_another_type_is_refused(whole: Path, settings: Settings, found: str) -> None:
+    with pytest.raises(BadRecording) as refused:
+        read_recording(whole, settings)
+    assert found in str(refused.value)
+
+
+def test_of_several_robots_one_is_driven_with_what_is_its_own(drive: recordings.Drive, tmp_path: Path) -> None:
+    said = [each._replace(topic=f"/{robot}{each.topic}") for each in drive.said for robot in ("one", "two")]
+    made = read_recording(recordings.write_mcap(tmp_path / "robots.mcap", said), replace(FOUND, odometry="/two/odom"))
+    assert made.used == {"/two/odom": 45, "/two/detections": 45}, "placed by its own tf_static"
+    assert "landmarks: /two/detections" in made.notes
+    (note,) = [note for note in made.notes if "another robot" in note]
+    assert "--landmarks /one/detections takes them" in note
+    assert not made.left_out
+
+
+def test_without_stamps_nothing_is_made_of_it(drive: recordings.Drive, tmp_path: Path) -> None:
+    for each in drive.said:
+        if each.topic != "/tf_static":
+            each.message.header.stamp = ros.stamp(0)
+    try:
+        path = recordings.write_mcap(tmp_path / "stampless.mcap", drive.said)
+    finally:
+        for each in drive.said:
+            if each.topic != "/tf_static":
+                each.message.header.stamp = ros.stamp(each.ns)
+    with pytest.raises(BadRecording, match="a stamp of 0"):
+        read_recording(path, FOUND)
+
+
+def test_observations_in_a_gap_of_odometry_are_not_used(drive: recordings.Drive, tmp_path: Path) -> None:
+    """An odometry far in the future leaves one: where between the two the robot was nobody knows."""
+    said = list(drive.said)
+    late = recordings.START_NS + 10**15
+    at = next(n for n, each in enumerate(said) if each.topic == "/odom" and n > 20)
+    said[at] = said[at]._replace(message=ros.odometry(late, (5.0, 0.0, 0.0)))
+    made = read_recording(recordings.write_mcap(tmp_path / "future.mcap", said), FOUND)
+    assert made.left_out["/detections"] > 30
+    (note,) = [note for note in made.notes if note.startswith("/detections")]
+    assert "a gap of" in note
+
+
+def test_poses_that_are_elsewhere_than_odometry_begins_are_said(drive: recordings.Drive, tmp_path: Path) -> None:
+    path = recordings.write_mcap(tmp_path / "amcl.mcap", [*drive.said[:5], recordings.amcl(), *drive.said[5:]])
+    made = read_recording(path, replace(FOUND, poses=("/amcl_pose",)))
+    (note,) = [note for note in made.notes if "--start pose" in note]
+    assert note.startswith("/amcl_pose: it says that the robot is 12.4 m")
+    begun = read_recording(path, replace(FOUND, poses=("/amcl_pose",), start="pose"))
+    assert not any("--start pose" in note for note in begun.notes)
+
+
+def test_the_letter_of_landmarks_is_not_a_robots(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, told = run(capsys, whole, "--in-process", "--letter", "l")
+    assert code != OK
+    assert "another one: this is that of landmarks" in told

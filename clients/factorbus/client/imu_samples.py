@@ -60,6 +60,13 @@ def warn_implausible(rows: F64, gravity: F64) -> None:
     A wrong sign is not seen here: which way is up in the samples depends on the pose.  The text is much the same for
     all factors of a drive, so that Python shows it once for each place that drafts them.
     """
+    wrong = implausible_units(rows, gravity)
+    if wrong:
+        warnings.warn(f"imu: samples: {'; '.join(wrong)}", ImplausibleSamples, stacklevel=4)
+
+
+def implausible_units(rows: F64, gravity: F64) -> list[str]:
+    """What in samples (n, 7), or none, looks as if it had other units than rad/s and m/s²."""
     turning = float(np.linalg.norm(rows[:, 1:4], axis=1).max())
     force = float(np.median(np.linalg.norm(rows[:, 4:], axis=1)))
     wrong = []
@@ -69,5 +76,4 @@ def warn_implausible(rows: F64, gravity: F64) -> None:
         wrong.append(f"the median of |accelerometer| is about {force:.1g} m/s²: is it in g? Multiply by {_STANDARD}")
     if force > _LARGEST:
         wrong.append(f"the median of |accelerometer| is about {force:.1g} m/s²: is it in mm/s², or thousandths of g?")
-    if wrong:
-        warnings.warn(f"imu: samples: {'; '.join(wrong)}", ImplausibleSamples, stacklevel=4)
+    return wrong

@@ -31,6 +31,8 @@ from factorbus.ros2.track import KeyframePlace, OdometryTrack, Sample
 
 _WAITING = 256
 _STILL = 1e-12  # metres and radians: no way at all
+_GAP_S = 60.0  # beyond that nobody knows where between two odometries the robot was
+_ELSEWHERE_M, _ELSEWHERE_RAD, _ELSEWHERE_SHARE = 1.0, 0.35, 0.1
 
 # What uses a message once odometry is there, of (draft, its stamp, its topic, itself).
 _Use = Callable[[Draft, int, str, Any], None]
@@ -62,6 +64,7 @@ class FrontEnd:
         """As new, for a map that is another one."""
         self._next, self._landmarks, self._wait_for_pose = first, set(landmarks), wait_for_pose
         self._T_map_odom = Transform(np.eye(3), np.zeros(3))
+        self._is_compared = False
         self._track.forget()
         self._waiting.clear()
         self._closures.forget()
@@ -212,6 +215,9 @@ class FrontEnd:
     def _check_covered(self, stamp_ns: int, topic: str) -> None:
         if not self._track.covers(stamp_ns):
             raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", "one for which odometry is still remembered")
+        if (gap_s := self._track.gap_s(stamp_ns)) > _GAP_S:
+            found = f"a stamp of {stamp_ns} ns, where odometry has a gap of {gap_s:.4g} s"
+            raise BadRosMessage(topic, found, f"odometry before and after it, at most {_GAP_S:g} s apart")
 
     def _use_pose(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
         T_map_base = self._space.fitted(transform_of(topic, message.pose.pose))
@@ -229,11 +235,25 @@ class FrontEnd:
         if _moves(place):
             covariance = carried(covariance, T_base_keyframe) + carried(self._floored_way(place), T_base_keyframe)
         row = self._space.row(T_map_keyframe)
+        if not begins:
+            self._compare(topic, T_map_base, place.keyframe.T_odom_base @ place.T)
         if begins:
             self._T_map_odom = T_map_keyframe @ place.keyframe.T_odom_base.inverse()
             draft.variable(self._space.pose, place.keyframe.key, row, stamp=sample.stamp_ns)
         weight = information(self._space.residual(covariance))
         draft.factor(f"prior_{self._space.pose}", (place.keyframe.key,), row, information=weight)
+
+    def _compare(self, topic: str, T_map_base: Transform, T_odom_base: Transform) -> None:
+        """Notes where the first pose is not where a map that begins with odometry has the robot."""
+        if self._is_compared or self._wait_for_pose:
+            return
+        self._is_compared = True
+        apart = T_odom_base.inverse() @ T_map_base
+        metres, way = float(np.linalg.norm(apart.t)), float(np.linalg.norm(T_odom_base.t))
+        if metres > _ELSEWHERE_M + _ELSEWHERE_SHARE * way or apart.angle() > _ELSEWHERE_RAD:
+            found = f"it says that the robot is {metres:.3g} m and {apart.angle():.3g} rad from where odometry has it"
+            advice = "the map begins where odometry does and stays there; with --start pose it begins where poses say"
+            self.remarks.append((topic, f"{found}: {advice}"))
 
     def _use_detections(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
         place = self._track.try_place(stamp_ns)
@@ -286,6 +306,8 @@ class FrontEnd:
 
     def _mount(self, topic: str, frame: str) -> Transform:
         mount = self._mounts.try_mount(self.base_frame, frame)
+        if mount is None and not frame:
+            raise BadRosMessage(topic, "observations without a frame", "the sensor's frame_id in the message's header")
         if mount is None:
             wanted = f"{self.base_frame!r}, or where that frame is on the robot: --mount {frame}=x,y,z,qx,qy,qz,qw"
             raise BadRosMessage(topic, f"observations in frame {frame!r}", wanted)

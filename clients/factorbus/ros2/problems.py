@@ -60,7 +60,7 @@ class BadRecording(Problem):
 
 
 class BadRosName(Problem):
-    """A topic, namespace, node or mount that cannot be."""
+    """A topic, namespace, node, letter or mount that cannot be."""
 
     code = "bad_ros_name"
 

@@ -88,6 +88,9 @@ class _Reading:
 
     def __init__(self, recording: RobotRecording, settings: Settings) -> None:
         self._recording, self._inputs = recording, settings.inputs()
+        # Of all robots, and this robot's own.
+        names = (STATIC, _namespaced(settings.odometry)[0] + STATIC)
+        self._statics = [topic.name for topic in _of_type(recording, TRANSFORMS) if topic.name in names]
         self._front_end = FrontEnd(settings, 0, (), settings.start == "pose")
         self.steps, self.used, self.left_out = RecordedSteps(), Counter[str](), Counter[str]()
         self._why: dict[str, str] = {}
@@ -95,10 +98,7 @@ class _Reading:
 
     def read(self) -> None:
         """All of it; where sensors are comes first, whenever it was said."""
-        statics = [
-            topic.name for topic in self._recording.topics if (topic.name, topic.type_name) == (STATIC, TRANSFORMS)
-        ]
-        for message in self._recording.messages(statics) if statics else ():
+        for message in self._recording.messages(self._statics) if self._statics else ():
             self._hear(message)
         for message in self._recording.messages(list(self._inputs)):
             if (draft := self._hear(message)) is not None:
@@ -124,9 +124,11 @@ class _Reading:
             except Exception as fault:  # whatever the bytes lead to
                 found = f"{counted(len(message.data), 'byte')} that cannot be read ({fault})"
                 raise BadRosMessage(topic, found, f"a {message.type_name}") from None
-            if topic == STATIC:
+            if topic in self._statics:
                 self._front_end.static(topic, read)
                 return None
+            if (header := getattr(read, "header", None)) and header.stamp.sec == header.stamp.nanosec == 0:
+                raise BadRosMessage(topic, "a stamp of 0, as of a driver that sets none", "the time of the measurement")
             draft = self._front_end.take(topic, self._inputs[topic], read)
         except BadRosMessage as bad:
             self._leave_out(bad, topic)
@@ -154,20 +156,20 @@ class _Reading:
 
 def _with_topics(recording: RobotRecording, settings: Settings) -> tuple[Settings, list[str]]:
     """The topics to read, those not named by their types, and what was chosen.  Raises BadRecording."""
-    topics = {topic.name: topic for topic in recording.topics}
     for name, type_name in settings.inputs().items():
-        if name not in topics:
-            raise BadRecording(recording.path, f"no topic {name}", f"one of {_listed(recording.topics)}")
-        if _type_of(topics[name]) != type_name:
-            found = f"topic {name} of {topics[name].type_name}"
-            raise BadRecording(recording.path, found, f"one of {type_name}")
+        _check_named(recording, type_name, name)
     notes = []
     if not settings.odometry:
         settings, note = _with_odometry(recording, settings)
         notes.append(note)
     if not settings.landmarks and (found := _of_type(recording, DETECTIONS)):
+        found, others = _of_this_robot(recording, settings, found)
         settings = replace(settings, landmarks=tuple(topic.name for topic in found))
-        notes.append(f"landmarks: {_listed(found)}")
+        if found:
+            notes.append(f"landmarks: {_listed(found)}")
+        if others:
+            takes = " ".join(f"--landmarks {topic.name}" for topic in others)
+            notes.append(f"landmarks of another robot left out: {_listed(others)}; {takes} takes them")
     settings, more = _with_graphs_and_fixes(recording, settings)
     notes += more
     if not settings.poses and (found := _of_type(recording, POSE)):
@@ -192,6 +194,37 @@ def _with_graphs_and_fixes(recording: RobotRecording, settings: Settings) -> tup
         settings = replace(settings, fixes=(best.name,))
         notes.append(f"GNSS: {best.name}{others}")
     return settings, notes
+
+
+def _check_named(recording: RobotRecording, type_name: str, name: str) -> None:
+    """Raises BadRecording: a topic that was named is not there, or has messages of another type."""
+    topics = {topic.name: topic for topic in recording.topics}
+    if name not in topics:
+        raise BadRecording(recording.path, f"no topic {name}", f"one of {_listed(recording.topics)}")
+    if _type_of(topics[name]) != type_name:
+        there = _listed(_of_type(recording, type_name)) or "none"
+        wanted = f"a topic of {type_name} (there is {there})"
+        raise BadRecording(recording.path, f"{name} is of {topics[name].type_name}", wanted)
+
+
+def _of_this_robot(
+    recording: RobotRecording, settings: Settings, found: Sequence[RecordedTopic]
+) -> tuple[list[RecordedTopic], list[RecordedTopic]]:
+    """(topics of the robot whose odometry is read, those of others).
+
+    Robots are told apart by the first part of names, where each has an odometry that is called the same behind it.
+    """
+    mine, name = _namespaced(settings.odometry)
+    robots = {_namespaced(topic.name)[0] for topic in _of_type(recording, ODOMETRY) if topic.name.endswith(f"/{name}")}
+    others = robots - {mine} if mine else set[str]()
+    theirs = [topic for topic in found if _namespaced(topic.name)[0] in others]
+    return [topic for topic in found if topic not in theirs], theirs
+
+
+def _namespaced(topic: str) -> tuple[str, str]:
+    """("/robot1", "odom") of /robot1/odom; ("", "odom") of /odom."""
+    first, _, rest = topic.removeprefix("/").partition("/")
+    return (f"/{first}", rest) if rest else ("", first)
 
 
 def _with_odometry(recording: RobotRecording, settings: Settings) -> tuple[Settings, str]:

@@ -12,6 +12,7 @@ from factorbus.ros2.problems import BadRosName
 USUAL_POSES, USUAL_LANDMARKS = ("/initialpose",), ("/detections",)
 # Of the key of the map's pose in the frame of GNSS, and the topic of the frames of sensors.
 FRAME_LETTER, STATIC = "f", "/tf_static"
+LANDMARK_LETTER = "l"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,7 @@ class Settings:
     map_frame: str = "map"
     space: str = "plane"
     letter: str = "x"
-    landmark_letter: str = "l"
+    landmark_letter: str = LANDMARK_LETTER
     start: str = "odometry"
     keyframe_m: float = 0.5
     keyframe_rad: float = 0.35
@@ -101,6 +102,8 @@ def robot_settings(options: RobotOptions) -> Settings:
     symbol(options.letter, 0)
     if options.letter == FRAME_LETTER:
         raise BadRosName("the letter", options.letter, f"another one: {FRAME_LETTER}0 is the frame of GNSS")
+    if options.letter == LANDMARK_LETTER:
+        raise BadRosName("the letter", options.letter, "another one: this is that of landmarks")
     return Settings(
         odometry=options.odom,
         poses=tuple(options.poses),

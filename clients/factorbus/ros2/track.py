@@ -113,6 +113,13 @@ class OdometryTrack:
         """Not before the first odometry that is kept."""
         return bool(self._samples) and stamp_ns >= self._samples[0].stamp_ns
 
+    def gap_s(self, stamp_ns: int) -> float:
+        """How far apart the odometries before and after it are, seconds; 0 at one, and after the last."""
+        at = bisect.bisect_right(self._samples, stamp_ns, key=lambda each: each.stamp_ns) - 1
+        if at + 1 == len(self._samples) or self._samples[at].stamp_ns == stamp_ns:
+            return 0.0
+        return 1e-9 * (self._samples[at + 1].stamp_ns - self._samples[at].stamp_ns)
+
     def before(self, stamp_ns: int) -> Sample:
         """The last odometry that is not later."""
         return self._interpolated(stamp_ns)[0]

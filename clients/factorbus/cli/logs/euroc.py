@@ -39,9 +39,12 @@ def read_euroc(folder: Path) -> SensorLog:
     """The log in a folder that has imu0.  Raises FormatError."""
     times, rates = timed(folder / "imu0" / "data.csv", 6, "gyroscopes, accelerometers")
     told, notes = (
-        sensor_settings(folder / "imu0" / "sensor.yaml"),
+        sensor_settings(folder / "imu0" / "sensor.yaml", {"T_BS", *(name for name, _ in _NOISE.values())}),
         [f"EuRoC: {counted(len(times), 'sample')} of {folder / 'imu0'}"],
     )
+    if "T_BS" in told and not np.array_equal(told["T_BS"], np.eye(4).ravel()):
+        wanted = "that of no motion: poses are those of the IMU, so T_BS of other sensors has to be from it"
+        raise FormatError(str(folder / "imu0" / "sensor.yaml"), None, f"T_BS {told['T_BS'].tolist()}", wanted)
     missing = [name for name, _ in _NOISE.values() if name not in told]
     densities = {mine: told.get(name, np.array([usual])) for mine, (name, usual) in _NOISE.items()}
     for mine, density in densities.items():
@@ -77,7 +80,7 @@ def _fixes(folder: Path, notes: list[str]) -> Fixes | None:
     if wrong.size:
         found = f"the {wrong[0] + 1}. fix: latitude {rows[wrong[0], 0]:g}, sigmas {rows[wrong[0], 3:].tolist()}"
         raise FormatError(str(file), None, found, "latitudes of -90 to 90 degrees and sigmas above 0")
-    origin = sensor_settings(folder / "sensor.yaml").get("origin", rows[0, :3])
+    origin = sensor_settings(folder / "sensor.yaml", {"origin"}).get("origin", rows[0, :3])
     if origin.size != 3 or abs(origin[0]) > 90:
         found = f"origin {origin.tolist()}"
         raise FormatError(str(folder / "sensor.yaml"), None, found, "latitude, longitude (degrees), height (metres)")
@@ -95,13 +98,12 @@ def _way(folder: Path, relative: bool, usual: tuple[float, float], notes: list[s
     if not file.exists():
         return None
     times, poses = _poses(file, *timed(file, 7, "position, qw qx qy qz"))
-    told = sensor_settings(folder / "sensor.yaml")
-    sigmas = [
-        float(told.get(f"sigma_{name}", np.array(s)).sum())
-        for name, s in zip(("position", "angle"), usual, strict=True)
-    ]
-    if min(sigmas) <= 0:
-        raise FormatError(str(folder / "sensor.yaml"), None, f"sigmas {sigmas}", "sigmas above 0")
+    told = sensor_settings(folder / "sensor.yaml", {"sigma_position", "sigma_angle"})
+    given = [told.get(f"sigma_{name}", np.array([s])) for name, s in zip(("position", "angle"), usual, strict=True)]
+    if any(each.size != 1 or not each[0] > 0 for each in given):
+        found = f"sigma_position {given[0].tolist()}, sigma_angle {given[1].tolist()}"
+        raise FormatError(str(folder / "sensor.yaml"), None, found, "a number above 0 for each: metres, radians")
+    sigmas = [float(each[0]) for each in given]
     each = "from one to the next" if relative else "each"
     said = "as in sensor.yaml" if "sigma_position" in told else "assumed"
     notes.append(
@@ -114,7 +116,7 @@ def _way(folder: Path, relative: bool, usual: tuple[float, float], notes: list[s
 def _mount(folder: Path, notes: list[str]) -> tuple[F64, F64 | None]:
     """(where the sensor is on the body (7,), how certain that is (6,) or None).  Raises FormatError."""
     file = folder / "sensor.yaml"
-    told: Mapping[str, F64] = sensor_settings(file)
+    told: Mapping[str, F64] = sensor_settings(file, {"T_BS", "sigma_T_BS"})
     matrix, sigma = told.get("T_BS"), told.get("sigma_T_BS")
     if matrix is None:
         notes.append(f"assumed: {folder.name} is in the middle of the body, for no sensor.yaml has a T_BS")

@@ -6,6 +6,7 @@ where there were too many samples between.  A front end does not know the future
 f0: fixes wait until the robot has moved `_FAR` times as far as they are uncertain, and enter with f0.
 """
 
+import warnings
 from collections.abc import Sequence
 from typing import overload
 
@@ -16,7 +17,7 @@ from factorbus.cli.logs.start import Start, course, started
 from factorbus.client.draft import Draft
 from factorbus.client.frames import compose, inverse
 from factorbus.client.imu import cut_samples
-from factorbus.client.imu_samples import GAP
+from factorbus.client.imu_samples import GAP, ImplausibleSamples, implausible_units
 from factorbus.formats import FormatError
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Variables
@@ -24,6 +25,7 @@ from factorbus.proto.symbols import symbol
 from factorbus.wording import counted
 
 _MOST, _FAR, _TOLERANCE_NS = 1000, 20.0, 5_000_000
+_FEWEST = 4  # samples of a factor: of one, the errors of way and velocity are the same number, and no covariance
 _FRAME = (100.0, 100.0, 100.0, 0.02, 0.02, 3.0)
 
 
@@ -37,7 +39,9 @@ class LogSteps(Sequence[Batch]):
         self._framed = log.fixes is not None and log.way is not None and log.way.relative
         self._frame, self._frame_step = self._aligned() if self._framed else (None, 0)
         self._last_way: tuple[int, int] | None = None
-        self._batches = [self._step(n) for n in range(len(self.times))]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ImplausibleSamples)  # once for the whole log, in its notes
+            self._batches = [self._step(n) for n in range(len(self.times))]
 
     @property
     def poses(self) -> int:
@@ -47,7 +51,9 @@ class LogSteps(Sequence[Batch]):
     @property
     def notes(self) -> tuple[str, ...]:
         """What was assumed of the start, for people."""
-        said = (self.start.why, *_gaps(self._log.imu.times))
+        rates = self._log.imu.rates
+        units = implausible_units(np.column_stack([np.ones(len(rates)), rates]), self._log.gravity)
+        said = (self.start.why, *_gaps(self._log.imu.times), *(f"IMU: {each}" for each in units))
         if not self._framed:
             return said
         frame = "GNSS's frame f0 is found out" if self._frame is not None else "fixes are left out: it moved too little"
@@ -174,7 +180,12 @@ def samples_between(log: SensorLog, begin: int, end: int) -> F64:
     rows = slice(max(int(np.searchsorted(times, begin, "right")) - 1, 0), int(np.searchsorted(times, end)))
     seconds = (times[rows] - begin) * 1e-9
     rates, lasts = log.imu.rates[rows], (end - begin) * 1e-9
-    return cut_samples(seconds, rates[:, :3], rates[:, 3:], 0.0, lasts, longest_s=np.inf)  # gaps are said
+    samples = cut_samples(seconds, rates[:, :3], rates[:, 3:], 0.0, lasts, longest_s=np.inf)  # gaps are said
+    if len(samples) >= _FEWEST:
+        return samples
+    parts = np.repeat(samples, _FEWEST, axis=0)
+    parts[:, 0] /= _FEWEST
+    return parts
 
 
 def _gaps(times: I64) -> tuple[str, ...]:

@@ -30,5 +30,5 @@ def _read(path: Path) -> SensorLog:
             return read_oxts(each)
     if (folder / IMU).exists() or (folder / GPS).exists():
         return read_gtsam_kitti(folder)
-    wanted = f"EuRoC's mav0/imu0, KITTI's {OXTS}/timestamps.txt and {OXTS}/data, or {IMU} and {GPS}"
-    raise FormatError(str(path), None, "a folder without a log that is known", wanted)
+    wanted = f"EuRoC's mav0/imu0, KITTI's {OXTS}/timestamps.txt and {OXTS}/data, {IMU} and {GPS}, or a rosbag2 folder"
+    raise FormatError(str(path), None, "a folder without a log or a recording that is known", wanted)

@@ -1,7 +1,7 @@
 """Numbers in text files, row by row; what is wrong is said with its line."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -64,9 +64,10 @@ def stamp_of_date(path: Path, line: int, text: str) -> int:
     return int(whole) * 10**9 + int((found[7] or "0").ljust(9, "0"))
 
 
-def sensor_settings(path: Path) -> Mapping[str, F64]:
-    """The numbers of a sensor.yaml: those after `name:`, and matrices after `name:` and `data: [...]`.
+def sensor_settings(path: Path, used: Collection[str]) -> Mapping[str, F64]:
+    """The numbers of a sensor.yaml: those after `name:`, and matrices after `name:` as `data: [...]` or row by row.
 
+    used: the names that are looked up; words in place of their numbers are refused, others are left out.
     Empty where there is no such file.  Raises FormatError.
     """
     if not path.exists():
@@ -74,15 +75,14 @@ def sensor_settings(path: Path) -> Mapping[str, F64]:
     text = re.sub(r"#.*", "", text_of(path, "a sensor.yaml"))
     found: dict[str, F64] = {}
     for name, body in re.findall(r"^(\w+):(.*?)(?=^\w|\Z)", text, re.MULTILINE | re.DOTALL):
-        inside = re.search(r"\[([^\]]*)\]", body)
-        words = (inside[1] if inside else body).replace(",", " ").split()
-        try:
-            numbers = [float(word) for word in words]
-        except ValueError:
-            continue  # words, such as a comment on the sensor
-        if numbers and not np.isfinite(numbers).all():
-            line = text[: text.index(f"{name}:")].count("\n") + 1
-            raise FormatError(str(path), line, f"{name} {words[0][:20]}", "finite numbers")
+        if name not in used:
+            continue  # of no use here, such as a comment on the sensor
+        line = text[: text.index(f"{name}:")].count("\n") + 1
+        inside = re.search(r"data:\s*\[([^\]]*)\]", body)
+        words = re.sub(r"[\[\],]|^\s*-(?=\s)", " ", inside[1] if inside else body, flags=re.MULTILINE).split()
+        numbers = _floats(path, line, words, f"of {name}")
+        if not numbers:
+            raise FormatError(str(path), line, f"{name} without a number", f"the numbers of {name}")
         found[name] = np.array(numbers)
     return found
 
