@@ -103,10 +103,10 @@ def test_far_away_samples_are_integrated_anew() -> None:
     for kept in (make_room(), anew(layout, z, z[BIAS])):
         room = make_room()
         put_delta_near(layout, z, kept, bias, room)
-        np.testing.assert_array_equal(room, wanted)
+        np.testing.assert_allclose(room, wanted, rtol=1e-13, atol=1e-15)
     room = make_room()
     put_delta(layout, z, bias, room, True)
-    np.testing.assert_array_equal(room, wanted)
+    np.testing.assert_allclose(room, wanted, rtol=1e-13, atol=1e-15)
 
 
 def test_near_a_bias_that_moved_the_second_order_is_there() -> None:

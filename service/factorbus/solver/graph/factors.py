@@ -74,7 +74,7 @@ def _kind(kind: wire.FactorKind) -> FactorKind:
     elif kind.imu and kind.imu.samples:
         code, equation, kept = layout.IMU, "MATH (3.48)", inertial.KEPT
     elif kind.imu:
-        code, equation = layout.PREINTEGRATED, "MATH (3.60)"
+        code, equation = layout.PREINTEGRATED, "MATH (3.65)"
     elif kind.is_linear:
         code, equation = layout.LINEAR, "MATH (3.26)"
     else:

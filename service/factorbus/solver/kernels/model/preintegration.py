@@ -132,7 +132,7 @@ def has_bits_of(bias: F64, room: F64) -> bool:
 
 @part
 def correct_to_first_order(form: ImuLayout, z: F64, bias: F64, room: F64) -> None:
-    """Δ of a measurement that is integrated already, which begins at z[0], at a bias (6,).  (3.60)
+    """Δ of a measurement that is integrated already, which begins at z[0], at a bias (6,).  (3.65)
 
     ΔR := ΔR exp(J_R δ_g),  J_R := Jr(J_R δ_g) J_R,  Δp += J_p δ,  Δv += J_v δ,  δ the bias less that of the measurement
     """
