@@ -197,6 +197,30 @@ def test_a_map_that_begins_with_a_pose_begins_at_the_odometry_before_it() -> Non
     assert stamps_of(told) == [SECOND]
 
 
+def test_odometry_that_does_not_say_whose_it_is_is_the_robots() -> None:
+    made = front_end()
+    for n in range(3):
+        message = ros.odometry(n * SECOND, (n * 1.0, 0.0, 0.0))
+        message.child_frame_id = ""
+        assert made.odometry(read(ODOMETRY, message)) is not None
+    assert made.base_frame == "base_link"
+    assert [text for _, text in made.remarks] == ["no child_frame_id: the robot's frame is taken to be 'base_link'"]
+    named = read(ODOMETRY, ros.odometry(3 * SECOND, (3.0, 0.0, 0.0)))
+    assert made.odometry(named) is not None, "one that names the same frame"
+    message = ros.odometry(4 * SECOND, (4.0, 0.0, 0.0))
+    message.header.frame_id = ""
+    with pytest.raises(BadRosMessage, match="frames"):
+        made.odometry(read(ODOMETRY, message))
+
+
+def test_covariances_that_repeat_are_looked_at_once_and_refused_each_time() -> None:
+    good, bad = np.eye(6).ravel(), -np.eye(6).ravel()
+    assert checked_covariance("/a", good, (0, 1, 5)) is checked_covariance("/b", good.copy(), (0, 1, 5))
+    for topic in ("/a", "/b"):
+        with pytest.raises(BadRosMessage, match=topic):
+            checked_covariance(topic, bad, (0, 1, 5))
+
+
 def test_a_pose_is_carried_to_its_keyframe_with_its_covariance() -> None:
     """At x0 the robot is at the origin; half a metre on, a pose says where it is: x0 is half a metre behind that."""
     made = front_end(floors=TINY, keyframe_m=1.0)

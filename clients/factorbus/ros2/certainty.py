@@ -10,6 +10,7 @@ inverted, and what is larger stays as it is.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -59,22 +60,35 @@ class Checked:
 
 def checked_covariance(topic: str, numbers: F64, axes: tuple[int, ...]) -> Checked:
     """The 6 × 6 covariance of a ROS message, of the axes that count.  Raises BadRosMessage."""
-    whole = np.asarray(numbers, np.float64).reshape(6, 6)
+    made = _check(np.asarray(numbers, np.float64).tobytes(), axes)
+    if isinstance(made, Checked):
+        return made
+    raise BadRosMessage(topic, *made)
+
+
+@lru_cache(maxsize=256)
+def _check(numbers: bytes, axes: tuple[int, ...]) -> Checked | tuple[str, str]:
+    """The covariance, whose arrays are read-only, or (what was found, what is wanted).
+
+    Kept, since most drivers send the same numbers with every message.
+    """
+    whole = np.frombuffer(numbers, np.float64).reshape(6, 6)
     if not np.isfinite(whole[np.ix_(axes, axes)]).all():
-        raise BadRosMessage(topic, "a covariance that is not finite", "finite numbers")
+        return "a covariance that is not finite", "finite numbers"
     unknown = tuple(axis for axis in axes if whole[axis, axis] >= UNKNOWN)
     axes = tuple(axis for axis in axes if axis not in unknown)
     part = whole[np.ix_(axes, axes)]
     size = float(np.abs(part).max(initial=0.0))
     if size >= UNKNOWN:
-        raise BadRosMessage(topic, f"a covariance with {size:.3g} off its diagonal", "less than its variances allow")
+        return f"a covariance with {size:.3g} off its diagonal", "less than its variances allow"
     if float(np.abs(part - part.T).max(initial=0.0)) > _ROUNDING * size:
-        raise BadRosMessage(topic, "a covariance that is not symmetric", "a symmetric matrix")
+        return "a covariance that is not symmetric", "a symmetric matrix"
     least = float(np.linalg.eigvalsh(part).min()) if size else 0.0
     if least < -_ROUNDING * size:
-        raise BadRosMessage(topic, f"a covariance with the eigenvalue {least:.3g}", "none below zero")
+        return f"a covariance with the eigenvalue {least:.3g}", "none below zero"
     made = np.zeros((6, 6))
     made[np.ix_(axes, axes)] = 0.5 * (part + part.T)
+    made.flags.writeable = False
     return Checked(made, unknown)
 
 

@@ -30,6 +30,7 @@ from factorbus.ros2.space import SPACES
 from factorbus.ros2.track import KeyframePlace, OdometryTrack, Sample
 
 _WAITING = 256
+_BASE_FRAME = "base_link"  # of odometry that does not say whose it is, as REP 105 has it
 _STILL = 1e-12  # metres and radians: no way at all
 _GAP_S = 60.0  # beyond that nobody knows where between two odometries the robot was
 _ELSEWHERE_M, _ELSEWHERE_RAD, _ELSEWHERE_SHARE = 1.0, 0.35, 0.1
@@ -151,11 +152,13 @@ class FrontEnd:
 
     def _sample(self, message: Any) -> Sample:
         topic = self._settings.odometry
-        frames = message.header.frame_id, message.child_frame_id
+        frames = message.header.frame_id, message.child_frame_id or _BASE_FRAME
         if self.base_frame and frames != (self.odometry_frame, self.base_frame):
             raise BadRosMessage(topic, f"frames {frames}", f"{self.odometry_frame, self.base_frame} as before")
-        if not all(frames):
-            raise BadRosMessage(topic, f"frames {frames}", "names of both the odometry and the base frame")
+        if not message.header.frame_id:
+            raise BadRosMessage(topic, f"frames {frames}", "the name of the odometry's frame in the message's header")
+        if not message.child_frame_id and self._track.latest is None:
+            self._notes.remark(topic, f"no child_frame_id: the robot's frame is taken to be {_BASE_FRAME!r}")
         stamp_ns = stamp_ns_of(topic, message.header.stamp)
         if self._track.latest is not None and stamp_ns <= self.stamp_ns:
             raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", f"one after the last, {self.stamp_ns} ns")

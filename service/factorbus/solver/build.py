@@ -33,7 +33,7 @@ def _sources() -> str:
         text = path.read_bytes()
         digest.update(f"{path.relative_to(folder).as_posix()} {len(text)}\n".encode() + text)
     for module in (kinds, inertial):  # kernels have their names and sizes as constants
-        digest.update(Path(module.__file__).read_bytes())
+        digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()[:12]
 
 
