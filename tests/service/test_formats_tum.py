@@ -145,7 +145,7 @@ def test_a_dialect_that_is_named_is_taken_at_its_word(tmp_path: Path) -> None:
     assert read(file, "tum").dialect == "tum"
     with pytest.raises(FormatError, match=": no pose; wanted"):
         read(file, "g2o").steps()
-    with pytest.raises(FormatError, match=r"one of g2o, toro, isam, slam\+\+, pyfg, jrl, tum"):
+    with pytest.raises(FormatError, match=r"one of g2o, toro, isam, slam\+\+, pyfg, jrl, tum, bal"):
         read(file, "kitti")
 
 
