@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
+from few_tries import give_up_after
 
 from factorbus.cli.driving.columns import merged
 from factorbus.cli.driving.drive import Compared
@@ -25,7 +26,6 @@ from factorbus.datasets import CATALOGUE, dataset_named
 from factorbus.formats import read
 from factorbus.simulate import Spiral, sphere
 from factorbus.solver import solve_batch
-from factorbus.solver.starts import descent
 
 FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
 POSES = 250
@@ -255,8 +255,7 @@ def test_a_search_that_ended_before_it_had_converged_is_told(
     command = ["replay", str(town), "--in-process", "--every", "100"]
     assert main(command) == OK
     assert "not converged" not in capsys.readouterr().out
-    monkeypatch.setattr(descent, "_CHUNK", 1)
-    monkeypatch.setattr(descent, "_MOST", 1)
+    give_up_after(1, monkeypatch.setattr)
     assert main([*command, "--json"]) == OK
     told = [each["batch_converged"] for each in json.loads(capsys.readouterr().out)["against_batch"]]
     assert False in told

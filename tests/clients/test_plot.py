@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from few_tries import give_up_after
 
 from factorbus.cli.driving.columns import merged, positions
 from factorbus.cli.main import main
@@ -11,7 +12,6 @@ from factorbus.cli.output.exits import BAD_FILE, OK, USAGE
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan
-from factorbus.solver.starts import descent
 from factorbus.viz import DriveHistory, MapLayers, drive_figure, map_figure, sparsity_figure, spread_of
 from factorbus.viz.ellipses import QUANTILE, outlines
 from factorbus.viz.geometry import view_of
@@ -163,8 +163,7 @@ def test_pictures_say_where_an_optimum_had_not_converged(town: Path, tmp_path: P
     svg = tmp_path / "picture.svg"
     assert main(["plot", "map", "--solve", str(town), "--out", str(svg)]) == OK
     assert "not converged" not in svg.read_text()
-    monkeypatch.setattr(descent, "_CHUNK", 1)
-    monkeypatch.setattr(descent, "_MOST", 1)
+    give_up_after(1, monkeypatch.setattr)
     assert main(["plot", "map", "--solve", str(town), "--out", str(svg)]) == OK
     assert "not converged, the true optimum may be lower" in svg.read_text()
     assert main(["plot", "drive", "--every", "100", str(town), "--out", str(svg)]) == OK

@@ -141,6 +141,7 @@ def test_killed_in_the_middle_of_changes_none_that_was_answered_is_lost_and_none
         assert not set(gone) & set(found)
         for each, factor in times.items():
             np.testing.assert_array_equal(found[each], base[each] * factor)
+        changer.wait_converged(PATIENCE_S)  # no further step comes between the two answers
         estimate, count = changer.ask_estimate(), len(pending_inserts) + 4
         stats = changer.stats()
         assert stats["variables"] == 400 + sum(n % 11 == 10 for n in range(count))

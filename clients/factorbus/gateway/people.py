@@ -30,7 +30,7 @@ class BadPeople(Problem):
     code = "bad_people"
 
     def __init__(self, where: str, seen: str, wanted: str) -> None:
-        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, wanted=wanted)
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=seen, wanted=wanted)
 
 
 class NotAllowed(Problem):
