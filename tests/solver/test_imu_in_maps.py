@@ -152,8 +152,9 @@ def test_why_accounts_for_it_as_for_any_factor(form: str) -> None:
         account = why_factor(blocks, factor)
         r, T, noise = twin.innovation(kind, keys, z, W[np.triu_indices(len(W))])
         assert (account.kind, list(account.keys)) == (kind, keys)
-        np.testing.assert_allclose(account.residual, residual(kind, [by_key(solver)[k][1] for k in keys], z), atol=1e-6)
-        np.testing.assert_allclose(account.chi2, r @ W @ r, rtol=1e-6, atol=1e-8)
+        # Samples near their bias are expanded, to 1e-5 standard deviations.
+        np.testing.assert_allclose(account.residual, residual(kind, [by_key(solver)[k][1] for k in keys], z), atol=1e-5)
+        np.testing.assert_allclose(account.chi2, r @ W @ r, rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(account.influence, np.trace(W @ T), rtol=1e-5, atol=1e-7)
         influence += account.influence
         if account.without is not None:
