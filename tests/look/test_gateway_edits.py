@@ -52,7 +52,9 @@ def test_a_false_closure_is_rejected_and_comes_back(bus: Bus, gateway: str) -> N
         assert editor.edit("restore", factors=[closure])["chi2"] == pytest.approx(before, rel=1e-6)
         again = editor.factor_between("x2", "x10")
         assert again != closure
-        assert editor.ask(f"factors/{again}")["inserted"] is None, "a robot measured it, whoever brought it back"
+        assert editor.ask(f"factors/{again}")["inserted"] is None, (
+            "a robot measured it, also after somebody restored it"
+        )
         assert editor.ask("edits")["rejected"] == []
         assert refused(lambda: editor.edit("restore", factors=[closure]))["code"] == "bad_option"
         assert editor.edit("undo", number=2)["undone"] == "local"

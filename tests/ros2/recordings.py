@@ -76,7 +76,7 @@ def drive() -> Drive:
         leg = (robot.SIDE_M / robot.STEPS, 0.0, 0.0)
         for step in [leg] * robot.STEPS + [(0.0, 0.0, math.pi / 2)]:
             true = ros.compose(true, step)
-            told = ros.compose(told, (robot.SCALE * step[0], 0.0, step[2] + robot.BEND * step[0]))
+            told = ros.compose(told, (robot.SCALE * step[0], 0.0, step[2] + robot.CURVATURE * step[0]))
             ns += 10**9
             said += _say(ns, true, told)
     return Drive(said, true, told)

@@ -14,7 +14,7 @@ SIDE_M, STEPS, STEP_S = 5.0, 10, 1.0
 TAGS = {"3": (2.5, 1.0), "17": (6.0, 2.5), "42": (2.5, 6.0), "dock": (-1.0, 2.5), "5": (2.5, 2.5)}
 # Where its camera is, and how far off its odometry: 3 % too long, and turning left.
 CAMERA = (0.3, 0.0, math.pi / 2)
-SCALE, BEND = 1.03, 0.02
+SCALE, CURVATURE = 1.03, 0.02
 REACH_M = 5.0
 KEYFRAMES = 1 + 4 * (STEPS + 1)
 
@@ -40,7 +40,7 @@ def drive(node: ros.RosNode) -> dict[str, object]:
     for _ in range(4):
         for leg in [(SIDE_M / STEPS, 0.0, 0.0)] * STEPS + [(0.0, 0.0, math.pi / 2)]:
             true = ros.compose(true, leg)
-            told = ros.compose(told, (SCALE * leg[0], 0.0, leg[2] + BEND * leg[0]))
+            told = ros.compose(told, (SCALE * leg[0], 0.0, leg[2] + CURVATURE * leg[0]))
             ns += int(STEP_S * 1e9)
             transform, attached = say(node, ns, true, told)
             numbers.append(attached[0])

@@ -19,7 +19,7 @@ from factorbus.ros2.messages import FIX, LINK, MAP_GRAPH, ODOMETRY, POSE_GRAPH, 
 
 Pose = tuple[float, float, float]
 SIDE_M, STEPS, LAPS = 10.0, 10, 2
-SCALE, BEND = 1.02, 0.01  # of odometry: too long, and to the left
+SCALE, CURVATURE = 1.02, 0.01  # of odometry: too long, and to the left
 LEVER, ORIGIN, TURN = (0.4, 0.1), (48.1, 11.5, 500.0), 0.7
 SIGMA_FIX = 0.3
 SPEEDS = [4e-4, 4e-4, 0.0, 0.0, 0.0, 4e-4]
@@ -44,7 +44,7 @@ def survey(seed: int = 3) -> Survey:
     for _ in range(4 * LAPS):
         for step in [(SIDE_M / STEPS, 0.0, 0.0)] * STEPS + [(0.0, 0.0, math.pi / 2)]:
             true.append(ros.compose(true[-1], step))
-            told.append(ros.compose(told[-1], (SCALE * step[0], 0.0, step[2] + BEND * step[0])))
+            told.append(ros.compose(told[-1], (SCALE * step[0], 0.0, step[2] + CURVATURE * step[0])))
     fixes = [_fix(each, random.normal(size=3) * SIGMA_FIX) for each in true]
     lap = 4 * (STEPS + 1)
     closures = [(n - lap, n, _closure(true[n - lap], true[n], random)) for n in range(lap, COUNT, EVERY)]

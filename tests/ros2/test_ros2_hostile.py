@@ -195,7 +195,7 @@ def test_extreme_numbers_leave_the_map_finite(space: str, record_property: Any) 
         for type_name in TOPICS:
             robot.hear(type_name, bytes(message(type_name, robot.ns, numbers).serialize()))
         robot.drive()
-    assert robot.said, "what was wrong is told"
+    assert robot.said, "the problem is reported"
     before = robot.inserted
     robot.drive()
     assert robot.inserted == before + 1, "after all of this it still drives"

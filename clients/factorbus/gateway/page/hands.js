@@ -1,4 +1,4 @@
-// The pointer: moves, turns and zooms a view; a click is told to whom it may concern, and so is something dragged.
+// The pointer: moves, turns and zooms a view; it reports clicks and drags to its listeners.
 
 const CLICK_PX = 4;
 
