@@ -7,9 +7,9 @@ import pytest
 from processes import Process, processes
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Where a service answers that all tests of this folder share; each test has maps of its own."""
+    """Where a service answers that the tests of one file share, each with maps of its own."""
     with processes(tmp_path_factory.mktemp("service")) as start:
         yield start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()[0]
 

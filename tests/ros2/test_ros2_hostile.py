@@ -234,6 +234,19 @@ def test_mutants_of_messages_are_read_or_refused(type_name: str, record_property
         end.hear(type_name, bytes(data))
 
 
+@pytest.mark.parametrize("type_name", [FIX, ODOMETRY])
+def test_a_signalling_nan_is_one_of_the_numbers_that_are_refused(type_name: str) -> None:
+    """An operation on it sets the flag of invalid operations, which NumPy reports as a warning; here that fails."""
+    signalling = (0x7FF0_0000_0000_0001).to_bytes(8, "little")
+    end = Robot("plane")
+    end.drive()
+    ahead = SECOND if type_name == ODOMETRY else 0
+    whole = bytes(message(type_name, end.ns + ahead, random.Random(1)).serialize())
+    for where in range(4, len(whole) - 8, 4):
+        end.hear(type_name, whole[:where] + signalling + whole[where + 8 :])
+    assert end.unused > 2
+
+
 def covariance(*diagonal: float) -> list[float]:
     return ros.diagonal(*diagonal)
 

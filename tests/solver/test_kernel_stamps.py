@@ -77,6 +77,8 @@ def stamps(source: str, monkeypatch: pytest.MonkeyPatch, kind: int = 1) -> dict[
     monkeypatch.setattr("factorbus.made_layout", layout, raising=False)
     made = types.ModuleType("factorbus.made")
     monkeypatch.setitem(sys.modules, made.__name__, made)
+    # What is made here is not provided to the kernels that other tests compile in this process.
+    monkeypatch.setattr(_jit._FOLDER, "_shared", [])
     exec(compile(source, __file__, "exec"), made.__dict__)
     return {name: stamp_of(getattr(made, name)) for name in NAMES}
 

@@ -16,9 +16,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.timeout(400))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Where a service answers that all tests share; each test has maps of its own."""
+    """Where a service answers that the tests of one file share, each with maps of its own."""
     folder = tmp_path_factory.mktemp("service")
     settings = folder / "service.toml"
     settings.write_text("[limits]\nmessage_bytes = 200_000\nparked_s = 0.5\n")

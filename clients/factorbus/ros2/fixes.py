@@ -74,7 +74,7 @@ def read_fix(topic: str, message: Any, sigma_m: float, axes: tuple[int, ...], no
     if message.status.status < 0:
         notes.remark(topic, "no fix (status -1): left out")
         return None
-    if not place[:2].any():
+    if place[0] == 0.0 and place[1] == 0.0:
         notes.remark(topic, "latitude 0 and longitude 0, as receivers without a fix say: left out")
         return None
     if not (abs(place[0]) <= 90.0 and abs(place[1]) <= 360.0):

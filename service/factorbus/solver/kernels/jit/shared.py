@@ -1,4 +1,4 @@
-"""Kernels that others call by their address, under a name that the linker finds: compiled once, whoever calls them.
+"""Kernels that others call by their address, under a name that the linker finds: compiled once for all callers.
 
 What a caller needs of one is its signature, which is declared with what it returns.  So a caller is compiled without
 the code of what it calls, and stays as it is when that is edited.  Code that is run needs the address as well: the
