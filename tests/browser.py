@@ -14,6 +14,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
 
 # As root a sandbox cannot be made; the software renderer stands in for a graphics card.
+_PATIENCE_MS = 120_000  # that renderer takes long where others work as well
 _OPTIONS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -29,6 +30,7 @@ def page_of(url: str, width: int = 1200, height: int = 800, *, evaluates: bool =
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=_OPTIONS)
         try:
             page = browser.new_page(viewport={"width": width, "height": height}, bypass_csp=evaluates)
+            page.set_default_timeout(_PATIENCE_MS)
             page.goto(url)
             yield page
         finally:
