@@ -6,7 +6,7 @@ import numpy as np
 from naive.dense_factors import boxplus, pose_matrix, pose_vector
 
 from factorbus.client import Draft
-from factorbus.client.alignment import Candidates
+from factorbus.client.alignment import CandidatePoses
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
 from factorbus.solver.covariance.blocks import CovarianceBlocks
@@ -129,14 +129,14 @@ def solved(steps: list[Draft]) -> Solver:
     return solver
 
 
-def as_matrices(kind: str, one: Solver, other: Solver, candidates: list[Candidate]) -> Candidates:
-    """Candidates with the poses and covariances of their maps."""
+def as_matrices(kind: str, one: Solver, other: Solver, candidates: list[Candidate]) -> CandidatePoses:
+    """CandidatePoses with the poses and covariances of their maps."""
     (a, known_a), (b, known_b) = (
         _known(solver, [getattr(each, end) for each in candidates]) for solver, end in ((one, "a"), (other, "b"))
     )
     z = np.array([pose_matrix(each.z) for each in candidates])
     noise = np.tile(np.diag(SEEN[kind] ** 2), (len(z), 1, 1))
-    return Candidates(a, b, z, noise, known_a, known_b, np.array([(each.a, each.b) for each in candidates]))
+    return CandidatePoses(a, b, z, noise, known_a, known_b, np.array([(each.a, each.b) for each in candidates]))
 
 
 def _known(solver: Solver, numbers: list[int]) -> tuple[np.ndarray, np.ndarray]:

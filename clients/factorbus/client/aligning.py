@@ -22,9 +22,9 @@ from factorbus.client.alignment import (
     FEWEST,
     MOST_BY_CHANCE,
     TOO_FEW,
-    Candidates,
+    CandidatePoses,
     Judgement,
-    adjoint,
+    adjoint_of,
     gap_between,
     judge,
 )
@@ -116,7 +116,7 @@ def align(
     ends = [_ends(pair, known_here, known_there) for group in given.factors for pair in group.keys.tolist()]
     of_a, of_b = [known_here[a] for a, *_ in ends], [known_there[b] for _, b, _ in ends]
     z, noise = _measured(given, kind, np.array([turned for *_, turned in ends]))
-    known = Candidates(
+    known = CandidatePoses(
         np.array([matrix for _, matrix in of_a]),
         np.array([matrix for _, matrix in of_b]),
         z,
@@ -186,7 +186,7 @@ def _measured(given: Batch, kind: str, turned: np.ndarray) -> tuple[F64, F64]:
     if kind == "se3":  # the residual of a rotation is half its angle
         radians = np.array([1.0] * 3 + [2.0] * 3)
         covariance *= radians[:, None] * radians
-    back = adjoint(z[turned])
+    back = adjoint_of(z[turned])
     covariance[turned] = back @ covariance[turned] @ back.swapaxes(1, 2)
     z[turned] = np.linalg.inv(z[turned])
     return z, covariance

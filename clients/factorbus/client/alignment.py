@@ -35,8 +35,8 @@ _MOST_ROUNDS, _MOST_JOINING = 20, 5
 ALIGNED, AMBIGUOUS, TOO_FEW = "aligned", "ambiguous", "too_few"
 
 
-class Candidates(NamedTuple):
-    """Candidates between two maps, as matrices: poses (n, k, k), k = 3 in the plane and 4 in space.
+class CandidatePoses(NamedTuple):
+    """CandidatePoses between two maps, as matrices: poses (n, k, k), k = 3 in the plane and 4 in space.
 
     a, b: the poses of their maps; z: as measured, (n, k, k).  noise (n, d, d): of z, in its tangent space, metres and
     radians.  known_a, known_b (n d, n d): the joint covariance of a, and of b.  pairs (n, 2): keys of a and b.
@@ -59,7 +59,7 @@ class _Fit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class AgreeingSet:
-    """Candidates that agree, and where they put the other map.
+    """CandidatePoses that agree, and where they put the other map.
 
     members (m,): which, ascending.  T: T_a_b, a matrix.  reference: the member in their midst.  covariance (d, d): of
     the pose B of the reference as seen from its pose A, in the tangent space of that, metres and radians.
@@ -87,7 +87,7 @@ class Judgement(NamedTuple):
     rival: AgreeingSet | None
 
 
-def judge(candidates: Candidates) -> Judgement:
+def judge(candidates: CandidatePoses) -> Judgement:
     """Find the largest set that agrees, and whether it is to be believed."""
     everyone = np.arange(len(candidates.z))
     best = _largest_set(candidates, everyone)
@@ -125,7 +125,7 @@ def log_of(T: F64) -> F64:
     return np.concatenate([T[..., :3, 3], turn], axis=-1)
 
 
-def adjoint(T: F64) -> F64:
+def adjoint_of(T: F64) -> F64:
     """Ad of rigid motions (..., k, k), (..., d, d): T exp(x) = exp(Ad x) T."""
     k = T.shape[-1]
     out = np.zeros((*T.shape[:-2], 3 * (k - 2), 3 * (k - 2)))
@@ -139,7 +139,7 @@ def adjoint(T: F64) -> F64:
     return out
 
 
-def are_consistent(c: Candidates) -> np.ndarray:
+def are_consistent(c: CandidatePoses) -> np.ndarray:
     """(n, n) bool: whether two candidates say the same, within three standard deviations."""
     n, d = len(c.z), c.noise.shape[1]
     i, j = np.triu_indices(n, 1)
@@ -147,9 +147,9 @@ def are_consistent(c: Candidates) -> np.ndarray:
     a_ij, b_ji = _inverse(c.a[i]) @ c.a[j], _inverse(c.b[j]) @ c.b[i]
     before = to_i @ a_ij @ c.z[j]
     loop = before @ b_ji
-    of_a = np.concatenate([-adjoint(to_i), adjoint(to_i @ a_ij)], axis=-1)
-    back = adjoint(before)
-    of_b = np.concatenate([adjoint(loop), -back], axis=-1)
+    of_a = np.concatenate([-adjoint_of(to_i), adjoint_of(to_i @ a_ij)], axis=-1)
+    back = adjoint_of(before)
+    of_b = np.concatenate([adjoint_of(loop), -back], axis=-1)
     covariance = c.noise[i] + back @ c.noise[j] @ back.swapaxes(1, 2)
     covariance += _of_pairs(of_a, c.known_a, i, j, d) + _of_pairs(of_b, c.known_b, i, j, d)
     r = log_of(loop)
@@ -169,7 +169,7 @@ def _of_pairs(jacobian: F64, known: F64, i: I64, j: I64, d: int) -> F64:
     return jacobian @ both @ jacobian.swapaxes(1, 2)
 
 
-def _largest_set(c: Candidates, among: I64) -> AgreeingSet | None:
+def _largest_set(c: CandidatePoses, among: I64) -> AgreeingSet | None:
     """The largest set among some candidates; None where no two agree."""
     if among.size < 2:
         return None
@@ -185,13 +185,13 @@ def _largest_set(c: Candidates, among: I64) -> AgreeingSet | None:
     return AgreeingSet(among[members], T, int(among[reference]), fit.covariance, by_chance)
 
 
-def _in_their_midst(c: Candidates, members: Sequence[int]) -> int:
+def _in_their_midst(c: CandidatePoses, members: Sequence[int]) -> int:
     """The member whose pose is nearest to the middle of all."""
     places = c.a[members, :-1, -1]
     return members[int(np.linalg.norm(places - np.median(places, axis=0), axis=1).argmin())]
 
 
-def _seen_from(c: Candidates, reference: int) -> Candidates:
+def _seen_from(c: CandidatePoses, reference: int) -> CandidatePoses:
     """The same with the poses of each map as seen from that of one candidate.
 
     How the whole map lies is certain then.  In a map whose heading is uncertain by 0.1 rad a pose 40 m from where it
@@ -207,7 +207,7 @@ def _poses_from(poses: F64, known: F64, reference: int) -> tuple[F64, F64]:
     seen = _inverse(poses[reference]) @ poses
     J = np.zeros((n, d, n, d))
     J[np.arange(n), :, np.arange(n)] = np.eye(d)
-    J[:, :, reference] -= adjoint(_inverse(seen))
+    J[:, :, reference] -= adjoint_of(_inverse(seen))
     J = J.reshape(n * d, n * d)
     return seen, J @ known @ J.T
 
@@ -234,15 +234,15 @@ def _refined(residuals: _Residuals, members: list[int], fit: _Fit) -> tuple[list
 class _Residuals:
     """r_i = Log(z_i⁻¹ A_i⁻¹ T B_i), what it is by T, and its covariance together with all others'."""
 
-    def __init__(self, c: Candidates) -> None:
+    def __init__(self, c: CandidatePoses) -> None:
         self.c, self.dim = c, c.noise.shape[1]
         n, d = len(c.z), self.dim
         of_a, covariance = np.zeros((n, d, n, d)), np.zeros((n, d, n, d))
-        of_a[np.arange(n), :, np.arange(n)] = adjoint(_inverse(c.z))
+        of_a[np.arange(n), :, np.arange(n)] = adjoint_of(_inverse(c.z))
         covariance[np.arange(n), :, np.arange(n)] = c.noise
         of_a = of_a.reshape(n * d, n * d)
         self._covariance = covariance.reshape(n * d, n * d) + of_a @ c.known_a @ of_a.T + c.known_b
-        self._by_T = adjoint(_inverse(c.b))
+        self._by_T = adjoint_of(_inverse(c.b))
         self._to_b = _inverse(c.z) @ _inverse(c.a)
 
     def own_covariance(self) -> F64:
@@ -313,7 +313,7 @@ def exp_of(x: F64) -> F64:
     return T
 
 
-def _chance(c: Candidates, residuals: _Residuals) -> float:
+def _chance(c: CandidatePoses, residuals: _Residuals) -> float:
     """How likely a false candidate puts the other map where a given one does, within the quantile.
 
     A false one puts it anywhere that the places of the candidates, in both maps, lead to, and turned in any way about
@@ -339,28 +339,28 @@ def _expected_by_chance(count: int, places: int, chance: float) -> float:
     return math.exp(min(logarithm + (places - 1) * math.log(max(chance, 1e-300)), 700.0))
 
 
-def _is_believed(c: Candidates, found: AgreeingSet) -> bool:
+def _is_believed(c: CandidatePoses, found: AgreeingSet) -> bool:
     return _count_places(c, found.members) >= FEWEST and found.by_chance <= MOST_BY_CHANCE
 
 
-def _count_places(c: Candidates, members: Sequence[int] | I64) -> int:
+def _count_places(c: CandidatePoses, members: Sequence[int] | I64) -> int:
     """Pairs of poses: two candidates between the same two say it once."""
     return len(np.unique(c.pairs[np.asarray(members)], axis=0))
 
 
-def _differs(c: Candidates, one: AgreeingSet, other: AgreeingSet) -> bool:
+def _differs(c: CandidatePoses, one: AgreeingSet, other: AgreeingSet) -> bool:
     """Whether they put the reference of the first at two places."""
     b = c.b[one.reference]
     r = log_of(_inverse(b) @ _inverse(one.T) @ other.T @ b)
-    moved = adjoint(_inverse(b) @ c.b[other.reference])
+    moved = adjoint_of(_inverse(b) @ c.b[other.reference])
     return float(r @ np.linalg.solve(one.covariance + moved @ other.covariance @ moved.T, r)) > THREE_SIGMAS[r.size]
 
 
-def _taken(c: Candidates, among: I64) -> Candidates:
+def _taken(c: CandidatePoses, among: I64) -> CandidatePoses:
     d = c.noise.shape[1]
     rows = (among[:, None] * d + np.arange(d)).ravel()
     square = np.ix_(rows, rows)
-    return Candidates(
+    return CandidatePoses(
         c.a[among], c.b[among], c.z[among], c.noise[among], c.known_a[square], c.known_b[square], c.pairs[among]
     )
 

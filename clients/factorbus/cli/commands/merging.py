@@ -10,6 +10,7 @@ from factorbus.cli.output.advice import MERGING, advising
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import OK
 from factorbus.cli.process.options import MapAddress, grouped
+from factorbus.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,10 +141,14 @@ def _candidates(file: Path, sigmas: str | None) -> Any:
             continue
         where = f"{file}, line {number}"
         if len(fields) not in (3, 4):
-            raise click.UsageError(f"{where} has {len(fields)} fields; wanted POSE OTHERS Z [SIGMAS]: x5 y8 0,2,-1.57")
+            raise click.UsageError(
+                f"{where} has {counted(len(fields), 'field')}; wanted POSE OTHERS Z [SIGMAS]: x5 y8 0,2,-1.57"
+            )
         z, own = _numbers(where, fields[2]), usual if len(fields) == 3 else _numbers(where, fields[3])
         if len(z) not in (3, 7):
-            raise click.UsageError(f"{where}: {fields[2]} is {len(z)} numbers; wanted x,y,theta or x,y,z,qx,qy,qz,qw")
+            raise click.UsageError(
+                f"{where}: {fields[2]} is {counted(len(z), 'number')}; wanted x,y,theta or x,y,z,qx,qy,qz,qw"
+            )
         if own is None:
             raise click.UsageError(f"{where} does not say how certain it is; give --sigmas, or a fourth field")
         draft.factor("between_se2" if len(z) == 3 else "between_se3", fields[:2], z, sigmas=own)
