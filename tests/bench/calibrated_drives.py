@@ -18,6 +18,7 @@ from naive.dense_factors import boxplus, pose_matrix, pose_vector
 from scipy.linalg import expm
 
 from factorbus.client import Draft
+from factorbus.client.draft_columns import DOWN
 
 POSES = 60
 ODOMETRY, IN_SPACE = np.array([0.02, 0.02, 0.01]), np.array([0.02] * 3 + [0.01] * 3)
@@ -70,8 +71,8 @@ def frame(rng: np.random.Generator) -> Calibrated:
         z = (pose_matrix(f) @ pose_matrix(pose) @ np.append(lever, 1.0))[:3] + rng.normal(0, sigma, 3)
         if n == 0:
             rough = np.array([*z, 0, 0, 0, 1])
-            draft.se3("c0", rough)
-            draft.prior_se3("c0", rough, sigmas=[100] * 3 + [np.radians(2)] * 2 + [np.pi])
+            draft.se3("c0", rough).position_se3("c0", z, sigmas=[100] * 3)
+            draft.attitude_se3("c0", DOWN, sigmas=[np.radians(2)] * 3)
         else:
             measured = boxplus("se3", way, rng.normal(0, IN_SPACE))
             draft.between_se3(f"x{n - 1}", f"x{n}", measured, sigmas=IN_SPACE)

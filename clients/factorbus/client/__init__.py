@@ -7,6 +7,7 @@
 `factorbus.client.aio` is the same for asyncio.  Light: numpy, msgpack and zenoh, no compiler.
 """
 
+from factorbus.client.aligning import Alignment, AmbiguousAlignment, NotAligned, align
 from factorbus.client.bus import Bus, connect
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
@@ -26,6 +27,8 @@ from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
 
 __all__ = [
     "AbsoluteFactors",
+    "Alignment",
+    "AmbiguousAlignment",
     "BadCamera",
     "Bus",
     "Camera",
@@ -45,6 +48,7 @@ __all__ = [
     "Mirror",
     "NoAnchor",
     "NoAnswerYet",
+    "NotAligned",
     "NotConverged",
     "PendingInsert",
     "PreintegratedImu",
@@ -53,6 +57,7 @@ __all__ = [
     "Snapshot",
     "Standstill",
     "Unavailable",
+    "align",
     "connect",
     "cut_samples",
     "initial_from_standstill",

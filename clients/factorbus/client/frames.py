@@ -45,6 +45,31 @@ def rotation_of(pose: F64) -> F64:
     )
 
 
+def matrix_of_pose(pose: F64) -> F64:
+    """A pose (3,) or (7,) as a matrix, (3, 3) or (4, 4)."""
+    T = np.eye(3 if pose.size == 3 else 4)
+    T[:-1, :-1], T[:-1, -1] = rotation_of(pose), pose[: len(T) - 1]
+    return T
+
+
+def pose_of_matrix(T: F64) -> F64:
+    """The pose (3,) or (7,) of a rigid motion."""
+    if len(T) == 3:
+        return np.array([T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0])])
+    R = T[:3, :3]
+    # Of 4 q qᵀ the column with the largest diagonal.
+    q = np.array(
+        [
+            [1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],
+            [R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2], R[0, 2] - R[2, 0]],
+            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1 + R[0, 0] + R[1, 1] + R[2, 2]],
+        ]
+    )
+    column = q[int(q.diagonal().argmax())]
+    return np.array([*T[:3, 3], *column / np.linalg.norm(column)])
+
+
 def difference(measured: F64, pose: F64) -> F64:
     """The residual of a relative pose: measured⁻¹ ∘ pose as (x, y, θ), or (x, y, z, qx, qy, qz) with qw ≥ 0."""
     left = compose(inverse(measured), pose[None])[0]

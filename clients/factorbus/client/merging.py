@@ -124,7 +124,7 @@ def fit_into(
     named = of_type("letters", letters or {}, Mapping, 'a mapping of letters, such as {"x": "y"}')
     given = Batch() if anchors is None else batch_of("anchors", anchors)
     size = _size_of(other.batch)
-    renamed = _renamed(other.batch, named)
+    renamed = with_letters(other.batch, named)
     roles = roles_of(renamed)
     of_robots, renamed = split_mounts(renamed)
     _check_keys(here, _together(of_robots, renamed))
@@ -159,8 +159,8 @@ def _size_of(batch: Batch) -> int:
     return sizes.pop()
 
 
-def _renamed(batch: Batch, letters: Mapping[str, str]) -> Batch:
-    """With other letters, and without ids, which are those of another map."""
+def with_letters(batch: Batch, letters: Mapping[str, str]) -> Batch:
+    """With other letters, and without ids, which are those of another map.  Raises CannotMerge, BadSymbol."""
     codes = {_code(old): _code(new) for old, new in letters.items()}
     _check_letters(batch, codes)
 

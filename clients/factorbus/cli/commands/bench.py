@@ -13,7 +13,17 @@ from factorbus.cli.process.options import json_option
 
 BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
 LONG = ("every-step", "paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
-ASKED = ("ask", "batch", "digest", "calibration", "inertial", "own", "ranges", "sizing")  # a minute or two; on request
+ASKED = (
+    "aligning",
+    "ask",
+    "batch",
+    "digest",
+    "calibration",
+    "inertial",
+    "own",
+    "ranges",
+    "sizing",
+)  # a minute or two; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -48,6 +58,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     digest     the report of every step and the bits of every estimate, as digests; --out FOLDER, --against FOLDER
     calibration   what sensors hide (mounts, scale, frame, clock, bias), found out by simulated drives: how far off in
                units of its covariance; --seeds, --only
+    aligning   two maps into one frame, of candidates of which most are false: how often right, wrong, left open;
+               --draws, --only
     inertial   drives with an IMU and GNSS that ship in the gtsam wheel, online, beside iSAM2 with the same factors;
                --only, --every
     ranges     range-only drives that ship in the gtsam wheel, online, beside iSAM2 with the same factors: χ² of

@@ -1,6 +1,7 @@
 """`factorbus change merge`: another map into this one."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import click
@@ -9,6 +10,7 @@ from factorbus.cli.output.advice import MERGING, advising
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import OK
 from factorbus.cli.process.options import MapAddress, grouped
+from factorbus.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +24,7 @@ class MergeOptions:
     frame: str | None
     sigmas: str | None
     absolute: str
+    candidates: Path | None
 
 
 @grouped("merging", MergeOptions)
@@ -50,6 +53,13 @@ class MergeOptions:
     show_default=True,
     help="What OTHER knows of its own frame, beyond where it begins.",
 )
+@click.option(
+    "--align",
+    "candidates",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    help="Candidates, of which many may be false: a line POSE OTHERS Z [SIGMAS] for each, numbers as for --anchor.",
+)
 def merge_command(address: MapAddress, other: str, merging: MergeOptions, settle: bool, as_json: bool) -> int:
     """Take all of map OTHER into NAME: its keys renamed, in NAME's frame, held by the anchors. OTHER stays as it is.
 
@@ -60,33 +70,45 @@ def merge_command(address: MapAddress, other: str, merging: MergeOptions, settle
     \b
     factorbus change merge hall robot2 --letter x=y --anchor x5 y8 0,2,-1.57 --sigmas 0.1,0.1,0.05 --settle
     factorbus change merge hall yard --from tcp/10.0.0.7:7447 --letter x=z --frame 12,-3,0.5 --sigmas 1,1,0.1
+    factorbus change merge hall yard --letter x=z --align matches.txt --sigmas 0.1,0.1,0.05
+
+    `--align` finds the largest set of candidates that agree, by what was measured and what both maps know of their
+    poses, and merges by these if the set is no coincidence and no other set of half its size says something else.
     """
     from factorbus.cli.process.bus import open_bus
+    from factorbus.client import align
     from factorbus.client.renaming_kinds import rename_kinds
 
-    sigmas = merging.sigmas
-    how = {
+    sigmas, file, found = merging.sigmas, merging.candidates, None
+    if file is not None and (merging.anchors or merging.frame):
+        raise click.UsageError("--align finds out what --anchor and --frame say; give one of them")
+    candidates = None if file is None else _candidates(file, sigmas)
+    how: dict[str, Any] = {
         "letters": dict(_pair("--letter", each, "x=y") for each in merging.letters),
         "anchors": _draft(merging.anchors, sigmas) if merging.anchors else None,
         "frame": _numbers("--frame", merging.frame) if merging.frame else None,
-        "sigmas": _numbers("--sigmas", sigmas) if sigmas else None,
+        "sigmas": _numbers("--sigmas", sigmas) if sigmas and file is None else None,
         "absolute": merging.absolute.replace("-", "_"),
     }
     endpoint, zenoh, timeout_s = address.endpoint, address.zenoh, address.timeout_s
-    with open_bus(endpoint, "change", zenoh, timeout_s) as bus:
-        with (
-            open_bus(merging.source or endpoint, "change", zenoh, timeout_s) as there,
-            there.map(other, mirror=False, create=False) as theirs,
-        ):
-            graph = theirs.graph(timeout_s)
-        with advising(MERGING), bus.map(address.name, mirror=False, create=False) as joined:
-            graph = rename_kinds(graph, dict(_pair("--kind", each, "wheel=wheel_2") for each in merging.kinds))
-            merged = joined.merge(graph, settle=settle, **how)
-    _show(merged, as_json)
+    with (
+        open_bus(endpoint, "change", zenoh, timeout_s) as bus,
+        open_bus(merging.source or endpoint, "change", zenoh, timeout_s) as there,
+        there.map(other, mirror=False, create=False) as theirs,
+        advising(MERGING),
+        bus.map(address.name, mirror=False, create=False) as joined,
+    ):
+        graph = theirs.graph(timeout_s)
+        if candidates is not None:
+            found = align(joined, theirs, candidates, letters=how["letters"], timeout_s=timeout_s)
+            how["anchors"] = found.anchors()
+        graph = rename_kinds(graph, dict(_pair("--kind", each, "wheel=wheel_2") for each in merging.kinds))
+        merged = joined.merge(graph, settle=settle, **how)
+    _show(merged, found, as_json)
     return OK
 
 
-def _show(merged: Any, as_json: bool) -> None:
+def _show(merged: Any, found: Any, as_json: bool) -> None:
     accepted, fitted = merged.accepted, merged.fitted
     counted = {
         "variables": fitted.batch.variable_count,
@@ -98,11 +120,39 @@ def _show(merged: Any, as_json: bool) -> None:
     if as_json:
         frame = fitted.frame.tolist()
         where = {"revision": accepted.revision, "first_factor": accepted.first_factor, "chi2": chi2, "frame": frame}
-        document(where | counted)
+        agreeing = {} if found is None else {"agree": found.agree.tolist(), "alignment": found.verdict}
+        document(where | counted | agreeing)
         return
+    if found is not None:
+        print(found)
     rows = [(what.replace("_", " "), str(count)) for what, count in counted.items()]
     where = " ".join(f"{number:.4g}" for number in fitted.frame)
     table([*rows, ("its origin", where), ("χ²", f"{chi2:.6g}")], title=f"At revision {accepted.revision}")
+
+
+def _candidates(file: Path, sigmas: str | None) -> Any:
+    """Of each line a relative pose.  Raises UsageError."""
+    from factorbus.client import Draft
+
+    draft, usual = Draft(), None if sigmas is None else _numbers("--sigmas", sigmas)
+    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+        fields = line.partition("#")[0].split()
+        if not fields:
+            continue
+        where = f"{file}, line {number}"
+        if len(fields) not in (3, 4):
+            raise click.UsageError(
+                f"{where} has {counted(len(fields), 'field')}; wanted POSE OTHERS Z [SIGMAS]: x5 y8 0,2,-1.57"
+            )
+        z, own = _numbers(where, fields[2]), usual if len(fields) == 3 else _numbers(where, fields[3])
+        if len(z) not in (3, 7):
+            raise click.UsageError(
+                f"{where}: {fields[2]} is {counted(len(z), 'number')}; wanted x,y,theta or x,y,z,qx,qy,qz,qw"
+            )
+        if own is None:
+            raise click.UsageError(f"{where} does not say how certain it is; give --sigmas, or a fourth field")
+        draft.factor("between_se2" if len(z) == 3 else "between_se3", fields[:2], z, sigmas=own)
+    return draft
 
 
 def _draft(anchors: tuple[tuple[str, str, str], ...], sigmas: str | None) -> Any:
