@@ -42,6 +42,7 @@ from factorbus.proto.symbols import format_symbol
 from factorbus.wording import counted
 
 MOST_CANDIDATES = 500
+_LEAST_INFORMATION = 1e-8  # σ 10 km: it says nothing
 _BETWEEN = {"between_se2": "se2", "between_se3": "se3"}
 
 
@@ -182,6 +183,7 @@ def _measured(given: Batch, kind: str, turned: np.ndarray) -> tuple[F64, F64]:
     omega = np.zeros((len(z), d, d))
     rows, columns = np.triu_indices(d)
     omega[:, rows, columns] = omega[:, columns, rows] = upper
+    _check_certain(given, z, omega)
     covariance: F64 = np.asarray(np.linalg.inv(omega), np.float64)
     if kind == "se3":  # the residual of a rotation is half its angle
         radians = np.array([1.0] * 3 + [2.0] * 3)
@@ -190,6 +192,20 @@ def _measured(given: Batch, kind: str, turned: np.ndarray) -> tuple[F64, F64]:
     covariance[turned] = back @ covariance[turned] @ back.swapaxes(1, 2)
     z[turned] = np.linalg.inv(z[turned])
     return z, covariance
+
+
+def _check_certain(given: Batch, z: F64, omega: F64) -> None:
+    """Raises CannotMerge: a candidate is no number, or says nothing of a direction."""
+    finite = np.isfinite(z).all(axis=(1, 2)) & np.isfinite(omega).all(axis=(1, 2))
+    known = np.zeros(len(z), bool)
+    known[finite] = np.linalg.eigvalsh(omega[finite])[:, 0] > _LEAST_INFORMATION
+    if not known.all():
+        pairs = np.concatenate([group.keys for group in given.factors])
+        named = ", ".join(map(format_symbol, pairs[int(known.argmin())].tolist()))
+        raise CannotMerge(
+            f"the candidate between {named} is no relative pose with a certainty in every direction (its information is "
+            f"not positive definite, or not finite); wanted σ below {_LEAST_INFORMATION**-0.5:g} m and rad in all"
+        )
 
 
 def _joint(of: Map, keys: list[int], timeout_s: float | None) -> F64:
