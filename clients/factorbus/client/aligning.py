@@ -203,8 +203,8 @@ def _check_certain(given: Batch, z: F64, omega: F64) -> None:
         pairs = np.concatenate([group.keys for group in given.factors])
         named = ", ".join(map(format_symbol, pairs[int(known.argmin())].tolist()))
         raise CannotMerge(
-            f"the candidate between {named} is no relative pose with a certainty in every direction (its information is "
-            f"not positive definite, or not finite); wanted σ below {_LEAST_INFORMATION**-0.5:g} m and rad in all"
+            f"the candidate between {named} is no relative pose with a certainty in every direction (its "
+            f"information is not positive definite, or not finite); wanted σ below {_LEAST_INFORMATION**-0.5:g} m and rad in all"
         )
 
 
