@@ -202,10 +202,9 @@ def _check_certain(given: Batch, z: F64, omega: F64) -> None:
     if not known.all():
         pairs = np.concatenate([group.keys for group in given.factors])
         named = ", ".join(map(format_symbol, pairs[int(known.argmin())].tolist()))
-        raise CannotMerge(
-            f"the candidate between {named} is no relative pose with a certainty in every direction (its "
-            f"information is not positive definite, or not finite); wanted σ below {_LEAST_INFORMATION**-0.5:g} m and rad in all"
-        )
+        seen = f"the candidate between {named} is no relative pose with a certainty in every direction"
+        least = f"σ below {_LEAST_INFORMATION**-0.5:g} m and rad in all"
+        raise CannotMerge(f"{seen} (its information is not positive definite, or not finite); wanted {least}")
 
 
 def _joint(of: Map, keys: list[int], timeout_s: float | None) -> F64:
