@@ -209,3 +209,19 @@ def nav_fix(
     covariance = [0.0] * 9
     covariance[::4] = [sigma**2 for sigma in sigmas]
     return words.NavSatFix(words.Header(stamp(ns), frame), words.NavSatStatus(status, 1), *place, covariance, kind)
+
+
+def imu(ns: int, rates: list[float], frame: str = "imu_link", orientation: float = -1.0) -> Any:
+    """rates: of gyroscopes and accelerometers.  orientation: the first of its covariance, −1 for none."""
+    none = words.Quaternion(0.0, 0.0, 0.0, 1.0) if orientation < 0 else words.Quaternion(0.6, 0.0, 0.0, 0.8)
+    return words.Imu(
+        words.Header(stamp(ns), frame), none, [orientation] + [0.0] * 8,
+        words.Vector3(*rates[:3]), [0.0] * 9, words.Vector3(*rates[3:]), [0.0] * 9,
+    )  # fmt: skip
+
+
+def space_odometry(ns: int, row: list[float]) -> Any:
+    """row: x y z qx qy qz qw."""
+    made = odometry(ns, (0.0, 0.0, 0.0))
+    made.pose.pose = words.Pose(words.Point(*row[:3]), words.Quaternion(*row[3:]))
+    return made

@@ -37,6 +37,17 @@ class TFMessage(IdlStruct, typename="TFMessage"):
 
 
 @dataclass
+class Imu(IdlStruct, typename="Imu"):
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: array[float64, 9]
+    angular_velocity: Vector3
+    angular_velocity_covariance: array[float64, 9]
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: array[float64, 9]
+
+
+@dataclass
 class ColorRGBA(IdlStruct, typename="ColorRGBA"):
     r: float32
     g: float32
@@ -183,7 +194,7 @@ PACKAGES = {
     ),
     "nav_msgs": (Odometry, Path),
     "tf2_msgs": (TFMessage,),
-    "sensor_msgs": (CompressedImage, NavSatFix, NavSatStatus),
+    "sensor_msgs": (CompressedImage, Imu, NavSatFix, NavSatStatus),
     "pose_graph_tools_msgs": (PoseGraphNode, PoseGraphEdge, PoseGraph),
     "rtabmap_msgs": (Link, MapGraph),
     "visualization_msgs": (Marker, MarkerArray, MeshFile, UVCoordinate),

@@ -15,11 +15,12 @@ from factorbus.proto.messages import Delta
 from factorbus.proto.symbols import symbol
 from factorbus.ros2 import display
 from factorbus.ros2.front_end import FrontEnd
+from factorbus.ros2.inertial import first_of_letter
 from factorbus.ros2.messages import LATEST_S, MARKERS, ODOMETRY, PATH, TRANSFORMS, Messages
 from factorbus.ros2.names import Topic
 from factorbus.ros2.node import Node
 from factorbus.ros2.problems import BadRosMessage, Unusable
-from factorbus.ros2.settings import FRAME_LETTER, STATIC, Settings
+from factorbus.ros2.settings import FRAME_LETTER, GRAVITY_LETTER, STATIC, Settings
 from factorbus.ros2.space import SPACES
 
 log = logging.getLogger("factorbus.ros2")
@@ -86,14 +87,15 @@ class Bridge:
     def _topic(self, name: str, type_name: str, depth: int) -> Topic:
         return Topic(name, type_name, self._messages.hash(type_name), depth)
 
-    def _place_in_map(self) -> tuple[int, list[int], bool, int]:
+    def _place_in_map(self) -> tuple[int, list[int], bool, int, int]:
         """The first index that is free, the landmarks there are, whether a pose has to be told first, and the first
-        index that is free of frames of GNSS."""
+        indices that are free of frames of GNSS and of gravity."""
         columns = self._map.estimate.snapshot().columns
         landmarks = columns.get(SPACES[self._settings.space].point, ([],))[0]
         waits = self._settings.start == "pose" or any(len(keys) for keys, _ in columns.values())
         first, frame = (_first_free(columns, letter) for letter in (self._settings.letter, FRAME_LETTER))
-        return first, list(map(int, landmarks)), waits, frame
+        gravity = _first_free(columns, GRAVITY_LETTER, first_of_letter(self._settings.letter))
+        return first, list(map(int, landmarks)), waits, frame, gravity
 
     def _why_wait(self) -> str:
         return (
@@ -219,10 +221,10 @@ class Bridge:
             log.warning("%s [%s] (%d so far)", problem.message, problem.code, count)
 
 
-def _first_free(columns: Mapping[str, Any], letter: str) -> int:
-    """The index after the last key of a letter."""
+def _first_free(columns: Mapping[str, Any], letter: str, begin: int = 0) -> int:
+    """The index after the last key of a letter, of the 2⁴⁰ from `begin` on, which it is counted from."""
     first = 0
     for keys, _ in columns.values():
-        mine = keys[(keys >> 56) == ord(letter)]
-        first = max([first, *(mine - symbol(letter, 0) + 1).tolist()])
+        mine = keys - symbol(letter, begin)
+        first = max([first, *(mine[(mine >= 0) & (mine < 1 << 40)] + 1).tolist()])
     return first
