@@ -67,6 +67,23 @@ class RosNode:
         key = topic_key(self._domain, topic, cls)
         self._kept.append(self._bus.declare_subscriber(key, Callback(hear, indirect=False)))
 
+    def call(self, service: str, timeout_s: float = 60.0, attached: bool = True) -> tuple[bool, str, Any]:
+        """(success, message, attachment) of a std_srvs/Trigger, called as rmw_zenoh's clients do."""
+        gid = [UInt8(byte) for byte in self._gid]
+        head = bytes(z_serialize(Int64(next(self._sequence)))) + bytes(z_serialize(Int64(time.time_ns())))
+        key = f"{self._domain}{service}/std_srvs::srv::dds_::Trigger_/{words.TRIGGER_HASH}"
+        replies = self._bus.get(
+            key,
+            payload=bytes(words.TriggerRequest(0).serialize()),
+            attachment=head + bytes(z_serialize(gid)) if attached else None,
+            target=zenoh.QueryTarget.ALL_COMPLETE,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+        )
+        (sample,) = [reply.ok for reply in replies if reply.ok is not None]
+        answer = words.TriggerResponse.deserialize(sample.payload.to_bytes())
+        return answer.success, answer.message, read_attachment(sample.attachment.to_bytes())
+
     def tokens(self) -> list[str]:
         """Who is there, as `ros2 topic list` finds out; where no token comes in time, it is asked again."""
         for _ in range(6):

@@ -56,7 +56,7 @@ def test_its_commands_run(spawn: Callable[..., Process]) -> None:
     with_graph.signal(signal.SIGINT)
     assert with_graph.wait() == 0
     with ros.session(router) as bus:
-        tokens = ros.RosNode(bus, 0).wait_for_endpoints(7)
+        tokens = ros.RosNode(bus, 0).wait_for_endpoints(8)
         assert any(token.endswith("/NN/%/%/factorbus") for token in tokens)
     bridge.signal(signal.SIGINT)
     assert bridge.wait() == 0

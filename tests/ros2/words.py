@@ -185,6 +185,21 @@ class MapGraph(IdlStruct, typename="MapGraph"):
     links: sequence[Link]
 
 
+@dataclass
+class TriggerRequest(IdlStruct, typename="Trigger_Request"):
+    structure_needs_at_least_one_member: uint8
+
+
+@dataclass
+class TriggerResponse(IdlStruct, typename="Trigger_Response"):
+    success: bool
+    message: str
+
+
+# As rmw_zenoh has it in the keys of services from Jazzy on.
+TRIGGER_HASH = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+
+
 PACKAGES = {
     "builtin_interfaces": (Time, Duration),
     "std_msgs": (Header, ColorRGBA),

@@ -9,14 +9,14 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Any
 
-from factorbus.client import Draft, Map, PendingInsert, Problem, Refused, Unavailable
+from factorbus.client import Draft, Map, PendingInsert, Problem, Refused, Snapshot, Unavailable
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta
 from factorbus.proto.symbols import symbol
 from factorbus.ros2 import display
 from factorbus.ros2.front_end import FrontEnd
 from factorbus.ros2.inertial import first_of_letter
-from factorbus.ros2.messages import LATEST_S, MARKERS, ODOMETRY, PATH, TRANSFORMS, Messages
+from factorbus.ros2.messages import LATEST_S, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
 from factorbus.ros2.names import Topic
 from factorbus.ros2.node import Node
 from factorbus.ros2.problems import BadRosMessage, Unusable
@@ -50,6 +50,7 @@ class Bridge:
         self._transforms = node.publisher(self._topic(settings.transforms, TRANSFORMS, 100))
         self._path = node.publisher(self._topic(settings.path, PATH, 1))
         self._markers = node.publisher(self._topic(settings.markers, MARKERS, 1))
+        self._pose = node.publisher(self._topic(settings.pose, POSE, 1))
         self._forget = joined.estimate.on_delta(self._on_delta)
         for name, type_name in settings.inputs().items():
             self._listen(node, self._topic(name, type_name, 10))
@@ -210,8 +211,21 @@ class Bridge:
             start, snapshot, stamp_ns = time.perf_counter(), mirror.snapshot(), self._front_end.stamp_ns
             self._path.publish(display.path(self._messages, self._settings, snapshot, stamp_ns))
             self._markers.publish(display.markers(self._messages, self._settings, snapshot, stamp_ns))
+            self._publish_pose(snapshot)
             drawn = snapshot.epoch, snapshot.revision
             pause_s = max(self._settings.display_s, (time.perf_counter() - start) / _DRAWING)
+
+    def _publish_pose(self, snapshot: Snapshot) -> None:
+        """The last keyframe, with the covariance that the service has of it by now."""
+        key = display.last_keyframe(self._settings, snapshot)
+        if key is None:
+            return
+        try:
+            covariance = self._map.uncertainty.covariance([key])[key]
+        except Problem as problem:  # the service is away, or the map another one
+            self._tell(problem, self._settings.pose)
+            return
+        self._pose.publish(display.certain_pose(self._messages, self._settings, snapshot, key, covariance))
 
     def _tell(self, problem: Problem, topic: str = "") -> None:
         """The first of a kind on a topic, then every hundredth."""

@@ -43,11 +43,12 @@ class RobotOptions:
 class BridgeOptions(RobotOptions):
     """Those of `factorbus ros2`, and what it publishes.
 
-    tf, path, markers: topics.  tolerance, display: seconds.
+    tf, path, markers, pose_out: topics.  tolerance, display: seconds.
     """
 
     tf: str
     path: str
     markers: str
+    pose_out: str
     tolerance: float
     display: float

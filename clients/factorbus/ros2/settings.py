@@ -61,6 +61,7 @@ class Settings:
     imu: str = ""
     path: str = "/factorbus/path"
     markers: str = "/factorbus/markers"
+    pose: str = "/factorbus/pose"
     transforms: str = "/tf"
     map_frame: str = "map"
     space: str = "plane"
@@ -97,6 +98,7 @@ def bridge_settings(options: BridgeOptions) -> Settings:
         landmarks=given.landmarks or USUAL_LANDMARKS,
         path=options.path,
         markers=options.markers,
+        pose=options.pose_out,
         transforms=options.tf,
         tolerance_s=options.tolerance,
         display_s=options.display,
