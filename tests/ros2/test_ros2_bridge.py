@@ -252,6 +252,8 @@ def test_a_front_end_with_closures_and_gnss_makes_the_map_of_the_same_graph(
         np.testing.assert_allclose(looked.estimate.columns("se2")[1], other.estimate.columns("se2")[1], atol=1e-4)
         while len(robot.wait_for("/factorbus/path")[0].poses) < survey.COUNT:
             pass
+        _, poses = robot.wait_for("/factorbus/markers")[0].markers
+        assert len(poses.points) == survey.COUNT, "the frame of GNSS is no pose of the robot"
         last, stamp = f"x{survey.COUNT - 1}", ros.stamp(survey.at(survey.COUNT - 1))
         while (pose := robot.wait_for("/factorbus/pose")[0]).header.stamp != stamp:
             pass
@@ -261,8 +263,6 @@ def test_a_front_end_with_closures_and_gnss_makes_the_map_of_the_same_graph(
         told = np.array(pose.pose.covariance).reshape(6, 6)[np.ix_((0, 1, 5), (0, 1, 5))]
         np.testing.assert_allclose(told, wanted, rtol=0.02, atol=1e-7)
         np.testing.assert_allclose(ros.plane(pose.pose.pose), looked.estimate[last], atol=1e-3)
-        _, poses = robot.wait_for("/factorbus/markers")[0].markers
-        assert len(poses.points) == survey.COUNT, "the frame of GNSS is no pose of the robot"
     joined.signal(signal.SIGINT)
     assert joined.wait() == 0
     log = joined.errors()

@@ -14,6 +14,7 @@ import words
 from imu_drive import NOISE, at
 from numpy.testing import assert_allclose
 from recordings import Said
+from test_ros2_readme import BLOCKS
 
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import OK
@@ -274,3 +275,12 @@ def test_in_the_plane_it_is_refused_with_a_word(capsys: pytest.CaptureFixture[st
 
 def test_the_definition_of_the_message_is_that_of_another_library() -> None:
     assert MESSAGES.hash(IMU) == words.type_hash(words.Imu)
+
+
+def test_a_recording_with_an_imu_is_replayed_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = imu_drive.imu_drive()
+    recordings.write_mcap(tmp_path / "drive.mcap", imu_drive.said(drive))
+    monkeypatch.chdir(tmp_path)
+    assert main(BLOCKS[5]) == 0
+    rows = [line.split() for line in (tmp_path / "drive.tum").read_text().splitlines()]
+    assert len(rows) == len(list(imu_drive.keyframes(drive)))
