@@ -53,7 +53,7 @@ class Continues(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class OdometryVerdict:
     """usable: odometries to be used now, in order.  wild: one that is not used.  late: this one is before the last."""
 
     usable: tuple[tuple[ToldOdometry, Continues], ...] = ()
@@ -80,11 +80,11 @@ class OdometryContinuity:
         """What waits for the next."""
         return self._held
 
-    def judge(self, told: ToldOdometry) -> Verdict:
+    def judge(self, told: ToldOdometry) -> OdometryVerdict:
         """What is to be done with an odometry."""
         last, held = self._last, self._held
         if last is None:
-            return Verdict((self._used(told, Continues.NEXT),))
+            return OdometryVerdict((self._used(told, Continues.NEXT),))
         if told.stamp_ns <= last.stamp_ns:
             return self._judge_late(told)
         self._late.clear()
@@ -95,41 +95,41 @@ class OdometryContinuity:
             return self._judge_held(held, told)
         if self._is_far(last, told) or _seconds(last, told) > LONGEST_S:
             self._held = told
-            return Verdict()
-        return Verdict((self._used(told, _by_time(last, told)),))
+            return OdometryVerdict()
+        return OdometryVerdict((self._used(told, _by_time(last, told)),))
 
-    def _judge_late(self, told: ToldOdometry) -> Verdict:
+    def _judge_late(self, told: ToldOdometry) -> OdometryVerdict:
         """Out of order, or the third of a clock that was set back."""
         if self._late and told.stamp_ns <= self._late[-1]:
             self._late.clear()
         self._late.append(told.stamp_ns)
         if len(self._late) < _LATE_IN_A_ROW:
-            return Verdict(late=True)
+            return OdometryVerdict(late=True)
         held, last = self._held, self._last
         usual = int(1e9 * self._usual_s())
         anew = last is not None and self._is_far(replace(last, stamp_ns=told.stamp_ns - usual), told)
         self._intervals.clear()
         self._held = None
-        return Verdict((self._used(told, Continues.ANEW if anew else Continues.CLOCK_BACK),), wild=held)
+        return OdometryVerdict((self._used(told, Continues.ANEW if anew else Continues.CLOCK_BACK),), wild=held)
 
-    def _judge_held(self, held: ToldOdometry, told: ToldOdometry) -> Verdict:
+    def _judge_held(self, held: ToldOdometry, told: ToldOdometry) -> OdometryVerdict:
         """A pose was far from that before, or much later; now another one has come."""
         last, self._held = self._last, None
         if last is None:
             raise ValueError("an odometry is held before there was a first one")
         if not self._is_far(last, held):
-            return Verdict((self._used(held, _by_time(last, held)), self._used(told, _by_time(held, told))))
+            return OdometryVerdict((self._used(held, _by_time(last, held)), self._used(told, _by_time(held, told))))
         onward, jump = _speed(held, told), _speed(last, held)
         if not self._is_far(last, told) and self._is_far(held, told):
-            return Verdict((self._used(told, _by_time(last, told)),), wild=held)
+            return OdometryVerdict((self._used(told, _by_time(last, told)),), wild=held)
         of = 0 if _apart(last, held)[0] > _AWAY_M else 1
         if onward[of] >= _AS_FAST * jump[of]:
-            return Verdict((self._used(held, _by_time(last, held)), self._used(told, _by_time(held, told))))
+            return OdometryVerdict((self._used(held, _by_time(last, held)), self._used(told, _by_time(held, told))))
         first = self._used(held, Continues.ANEW)
         if self._is_far(held, told):
             self._held = told
-            return Verdict((first,))
-        return Verdict((first, self._used(told, _by_time(held, told))))
+            return OdometryVerdict((first,))
+        return OdometryVerdict((first, self._used(told, _by_time(held, told))))
 
     def _used(self, told: ToldOdometry, how: Continues) -> tuple[ToldOdometry, Continues]:
         last = self._last

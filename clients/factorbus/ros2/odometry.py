@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from factorbus.ros2.continuity import Continues, OdometryContinuity, ToldOdometry, Verdict, speed_of
+from factorbus.ros2.continuity import Continues, OdometryContinuity, OdometryVerdict, ToldOdometry, speed_of
 from factorbus.ros2.geometry import local
 from factorbus.ros2.message_parts import Notes, stamp_ns_of, transform_of
 from factorbus.ros2.problems import BadRosMessage
@@ -66,7 +66,7 @@ class OdometryReader:
         seen = f"a pose at {x:.4g}, {y:.4g}, {z:.4g} m that is far from those before and after it"
         return BadRosMessage(self._topic, seen, "poses that follow each other")
 
-    def _say(self, verdict: Verdict, last_ns: int) -> None:
+    def _say(self, verdict: OdometryVerdict, last_ns: int) -> None:
         for told, how in verdict.usable:
             seconds = 1e-9 * (told.stamp_ns - last_ns)
             last_ns = told.stamp_ns
