@@ -242,6 +242,19 @@ def test_a_robot_that_stands_has_a_keyframe_for_every_thousand_samples() -> None
     assert inertial(batches) == [("x0", "x1"), ("x1", "x2")]
 
 
+def test_at_an_even_speed_an_imu_feels_nothing_and_odometry_tells_that_the_robot_moves() -> None:
+    said = []
+    for n in range(301):
+        ns = at(0.01 * n)
+        said.append(Said("/imu/data_raw", IMU, ns, ros.imu(ns, [0.0, 0.0, 0.0, 0.0, 0.0, 9.80665])))
+        if n % 10 == 0:
+            said.append(Said("/odom", ODOMETRY, ns, ros.odometry(ns, (0.02 * n, 0.0, 0.0))))
+    made, batches, _ = feed(said, replace(SETTINGS, mounts={"imu_link": from_quaternion((0, 0, 0), (0, 0, 0, 1))}))
+    assert_allclose(columns(batches)["vector3", "V0"], [2.0, 0.0, 0.0], atol=1e-9)
+    assert_allclose(columns(batches)["vector3", "G0"], [0.0, 0.0, -9.80665], atol=1e-9)
+    assert any("where the robot moves" in text for _, text in made.remarks)
+
+
 def test_after_a_refusal_it_goes_on_from_what_is_in_the_map(drive: imu_drive.ImuDrive) -> None:
     said = imu_drive.said(drive)
     frames = list(imu_drive.keyframes(drive))

@@ -218,18 +218,20 @@ def test_options_arrive() -> None:
 
 @pytest.mark.parametrize("space", ["plane", "space"])
 def test_a_pose_has_its_covariance_about_the_axes_of_the_map(space: str) -> None:
-    """It looks along y: what is uncertain ahead of it is so along y."""
+    """It looks 0.3 rad to the left of x: what is uncertain ahead of it is so along that way."""
     settings, key = Settings(space=space, letter="a"), symbol("a", 5)
     flat = space == "plane"
-    row = [1.0, 2.0, np.pi / 2] if flat else [1.0, 2.0, 3.0, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
+    row = [1.0, 2.0, 0.3] if flat else [1.0, 2.0, 3.0, 0.0, 0.0, np.sin(0.15), np.cos(0.15)]
     keys, kind = np.array([symbol("a", 4), key, symbol("b", 9)]), "se2" if flat else "se3"
     snapshot = Snapshot(1, 1, {kind: (keys, np.tile(row, (3, 1)))}, {kind: np.array([1, 7 * 10**9 + 5, 2])})
     assert display.last_keyframe(settings, snapshot) == key
     told = np.diag([4.0, 1.0, 0.1]) if flat else np.diag([4.0, 1.0, 2.0, 0.4, 0.1, 0.2])
     data = display.certain_pose(MESSAGES, settings, snapshot, key, told)
     read = words.PoseWithCovarianceStamped.deserialize(data)
-    wanted = [1.0, 4.0, 0.0, 0.0, 0.0, 0.1] if flat else [1.0, 4.0, 2.0, 0.1, 0.4, 0.2]
-    np.testing.assert_allclose(np.array(read.pose.covariance).reshape(6, 6), np.diag(wanted), atol=1e-12)
+    c, s = np.cos(0.3), np.sin(0.3)
+    R = np.kron(np.eye(2), [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    wanted = R @ np.diag([4.0, 1.0, 0.0, 0.0, 0.0, 0.1] if flat else np.diag(told)) @ R.T
+    np.testing.assert_allclose(np.array(read.pose.covariance).reshape(6, 6), wanted, atol=1e-12)
     assert (read.header.frame_id, read.header.stamp) == ("map", ros.stamp(7 * 10**9 + 5))
-    assert ros.plane(read.pose.pose) == pytest.approx((1.0, 2.0, np.pi / 2))
+    assert ros.plane(read.pose.pose) == pytest.approx((1.0, 2.0, 0.3))
     assert display.last_keyframe(settings, Snapshot(1, 1, {}, {})) is None
