@@ -68,7 +68,7 @@ class Robot:
         self.sizes: dict[str, int] = {}
         for word, key in (("delta", keys.delta_key(MAP)), ("tf", ros.topic_key(DOMAIN, "/tf", words.TFMessage))):
             bus.declare_subscriber(key, Callback(self._hear(word), indirect=False))
-        self._node.wait_for_endpoints(7)
+        self._node.wait_for_endpoints(8)
 
     def exchange(self) -> Sample:
         """One keyframe on."""

@@ -29,7 +29,7 @@ def main() -> None:
             node.subscribe(topic, cls)
         print("ready", flush=True)
         sys.stdin.readline()
-        node.wait_for_endpoints(7)
+        node.wait_for_endpoints(8)
         print("done", json.dumps(drive(node) | {"tokens": node.tokens()}), flush=True)
 
 

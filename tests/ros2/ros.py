@@ -67,6 +67,23 @@ class RosNode:
         key = topic_key(self._domain, topic, cls)
         self._kept.append(self._bus.declare_subscriber(key, Callback(hear, indirect=False)))
 
+    def call(self, service: str, timeout_s: float = 60.0, attached: bool = True) -> tuple[bool, str, Any]:
+        """(success, message, attachment) of a std_srvs/Trigger, called as rmw_zenoh's clients do."""
+        gid = [UInt8(byte) for byte in self._gid]
+        head = bytes(z_serialize(Int64(next(self._sequence)))) + bytes(z_serialize(Int64(time.time_ns())))
+        key = f"{self._domain}{service}/std_srvs::srv::dds_::Trigger_/{words.TRIGGER_HASH}"
+        replies = self._bus.get(
+            key,
+            payload=bytes(words.TriggerRequest(0).serialize()),
+            attachment=head + bytes(z_serialize(gid)) if attached else None,
+            target=zenoh.QueryTarget.ALL_COMPLETE,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+        )
+        (sample,) = [reply.ok for reply in replies if reply.ok is not None]
+        answer = words.TriggerResponse.deserialize(sample.payload.to_bytes())
+        return answer.success, answer.message, read_attachment(sample.attachment.to_bytes())
+
     def tokens(self) -> list[str]:
         """Who is there, as `ros2 topic list` finds out; where no token comes in time, it is asked again."""
         for _ in range(6):
@@ -209,3 +226,19 @@ def nav_fix(
     covariance = [0.0] * 9
     covariance[::4] = [sigma**2 for sigma in sigmas]
     return words.NavSatFix(words.Header(stamp(ns), frame), words.NavSatStatus(status, 1), *place, covariance, kind)
+
+
+def imu(ns: int, rates: list[float], frame: str = "imu_link", orientation: float = -1.0) -> Any:
+    """rates: of gyroscopes and accelerometers.  orientation: the first of its covariance, −1 for none."""
+    none = words.Quaternion(0.0, 0.0, 0.0, 1.0) if orientation < 0 else words.Quaternion(0.6, 0.0, 0.0, 0.8)
+    return words.Imu(
+        words.Header(stamp(ns), frame), none, [orientation] + [0.0] * 8,
+        words.Vector3(*rates[:3]), [0.0] * 9, words.Vector3(*rates[3:]), [0.0] * 9,
+    )  # fmt: skip
+
+
+def space_odometry(ns: int, row: list[float]) -> Any:
+    """row: x y z qx qy qz qw."""
+    made = odometry(ns, (0.0, 0.0, 0.0))
+    made.pose.pose = words.Pose(words.Point(*row[:3]), words.Quaternion(*row[3:]))
+    return made

@@ -304,15 +304,18 @@ def test_without_stamps_nothing_is_made_of_it(drive: recordings.Drive, tmp_path:
 
 
 def test_observations_in_a_gap_of_odometry_are_not_used(drive: recordings.Drive, tmp_path: Path) -> None:
-    """An odometry far in the future leaves one: where between the two the robot was nobody knows."""
-    said = list(drive.said)
+    """Where between the two odometries the robot was nobody knows."""
     late = recordings.START_NS + 10**15
-    at = next(n for n, each in enumerate(said) if each.topic == "/odom" and n > 20)
-    said[at] = said[at]._replace(message=ros.odometry(late, (5.0, 0.0, 0.0)))
+    odometry = [n for n, each in enumerate(drive.said) if each.topic == "/odom"]
+    said = [each for n, each in enumerate(drive.said) if n not in odometry[10:]]
+    end = drive.said[odometry[10]]
+    said += [end._replace(ns=ns, message=ros.odometry(ns, (5.0, 0.0, 0.0))) for ns in (late, late + 10**9)]
     made = read_recording(recordings.write_mcap(tmp_path / "future.mcap", said), FOUND)
     assert made.left_out["/detections"] > 30
-    (note,) = [note for note in made.notes if note.startswith("/detections")]
-    assert "a gap of" in note
+    notes = [note for note in made.notes if note.startswith("/detections")]
+    assert len(notes) == 1
+    assert "a gap of" in notes[0]
+    assert any("no odometry for 1e+06 s, or a clock that was set ahead" in note for note in made.notes)
 
 
 def test_poses_that_are_elsewhere_than_odometry_begins_are_said(drive: recordings.Drive, tmp_path: Path) -> None:

@@ -79,10 +79,14 @@ def there_is(tokens: list[str], domain: int, gid: str) -> None:
         ("MP", "%tf", "tf2_msgs::msg::dds_::TFMessage_", "::,100:,:,:,,"),
         ("MP", "%factorbus%path", "nav_msgs::msg::dds_::Path_", "::,1:,:,:,,"),
         ("MP", "%factorbus%markers", "visualization_msgs::msg::dds_::MarkerArray_", "::,1:,:,:,,"),
+        ("MP", "%factorbus%pose", "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_", "::,1:,:,:,,"),
         ("MS", "%odom", "nav_msgs::msg::dds_::Odometry_", "::,10:,:,:,,"),
         ("MS", "%initialpose", "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_", "::,10:,:,:,,"),
         ("MS", "%detections", "vision_msgs::msg::dds_::Detection3DArray_", "::,10:,:,:,,"),
         ("MS", "%tf_static", "tf2_msgs::msg::dds_::TFMessage_", ":1:,100:,:,:,,"),  # with what was said before
+    } | {
+        ("SS", f"%factorbus%{name}", "std_srvs::srv::dds_::Trigger_", "::,10:,:,:,,")
+        for name in ("settle", "save", "fork", "repair", "accept", "reject")
     }
     (tf,) = [token for token in tokens if "/%tf/" in token]
     number = xxhash.xxh3_128_intdigest(tf.encode())
@@ -105,7 +109,7 @@ def test_what_cannot_be_used_is_refused_and_the_rest_goes_on(
     endpoint: str, spawn: Callable[..., Process], node: Any
 ) -> None:
     joined = bridge(spawn, endpoint, "refusing", 9)
-    node.wait_for_endpoints(7)
+    node.wait_for_endpoints(8)
     bad = ros.odometry(SECOND, (0.0, 0.0, 0.0))
     bad.pose.covariance[0] = -1.0
     node.publish("/odom", bad)
@@ -135,7 +139,7 @@ def test_a_map_that_is_not_empty_waits_for_a_pose(endpoint: str, spawn: Callable
     with connect(endpoint, client="first") as bus, bus.map("shared") as looked:
         looked.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
         joined = bridge(spawn, endpoint, "shared", 9, "--letter", "a")
-        node.wait_for_endpoints(7)
+        node.wait_for_endpoints(8)
         for n in range(1, 4):
             node.publish("/odom", ros.odometry(n * SECOND, (float(n), 0.0, 0.0)))
         node.publish("/initialpose", ros.known_pose(3 * SECOND, (5.0, 5.0, math.pi / 2), [0.01] * 6))
@@ -149,7 +153,7 @@ def test_a_map_that_is_not_empty_waits_for_a_pose(endpoint: str, spawn: Callable
 
 def test_a_map_that_is_made_anew_is_begun_anew(endpoint: str, spawn: Callable[..., Process], node: Any) -> None:
     joined = bridge(spawn, endpoint, "dropped", 9)
-    node.wait_for_endpoints(7)
+    node.wait_for_endpoints(8)
     with connect(endpoint, client="operator") as bus:
         node.publish("/odom", ros.odometry(SECOND, (0.0, 0.0, 0.0)))
         node.wait_for("/tf")
@@ -183,7 +187,7 @@ def test_a_service_that_is_killed_costs_nothing(spawn: Callable[..., Process], t
     with ros.session(router) as bus:
         robot = ros.RosNode(bus, 10)
         robot.subscribe("/tf", words.TFMessage)
-        robot.wait_for_endpoints(7)
+        robot.wait_for_endpoints(8)
 
         def drive(first: int, last: int) -> None:
             for n in range(first, last):
@@ -227,9 +231,10 @@ def test_a_front_end_with_closures_and_gnss_makes_the_map_of_the_same_graph(
         robot.latch("/tf_static", static.message)
         robot.subscribe("/factorbus/path", words.Path)
         robot.subscribe("/factorbus/markers", words.MarkerArray)
+        robot.subscribe("/factorbus/pose", words.PoseWithCovarianceStamped)
         topics = ("--pose-graph", "/kimera/pose_graph", "--fix", "/gps/fix")
         joined = bridge(spawn, endpoint, "surveyed", 11, "--display", "0.1", *topics)
-        robot.wait_for_endpoints(9)
+        robot.wait_for_endpoints(10)
         for each in said:
             robot.publish(each.topic, each.message)
         other.insert(survey.drafted(made))
@@ -249,6 +254,15 @@ def test_a_front_end_with_closures_and_gnss_makes_the_map_of_the_same_graph(
             pass
         _, poses = robot.wait_for("/factorbus/markers")[0].markers
         assert len(poses.points) == survey.COUNT, "the frame of GNSS is no pose of the robot"
+        last, stamp = f"x{survey.COUNT - 1}", ros.stamp(survey.at(survey.COUNT - 1))
+        while (pose := robot.wait_for("/factorbus/pose")[0]).header.stamp != stamp:
+            pass
+        c, s = (f(looked.estimate[last][2]) for f in (math.cos, math.sin))
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        wanted = R @ looked.uncertainty.covariance([last])[last] @ R.T
+        told = np.array(pose.pose.covariance).reshape(6, 6)[np.ix_((0, 1, 5), (0, 1, 5))]
+        np.testing.assert_allclose(told, wanted, rtol=0.02, atol=1e-7)
+        np.testing.assert_allclose(ros.plane(pose.pose.pose), looked.estimate[last], atol=1e-3)
     joined.signal(signal.SIGINT)
     assert joined.wait() == 0
     log = joined.errors()

@@ -24,6 +24,7 @@ from factorbus.ros2.front_end import FrontEnd
 from factorbus.ros2.messages import (
     DETECTIONS,
     FIX,
+    IMU,
     LINK,
     MAP_GRAPH,
     ODOMETRY,
@@ -41,7 +42,7 @@ SECOND = 10**9
 LARGEST = sys.float_info.max
 TOPICS = {
     ODOMETRY: "/odom", POSE: "/initialpose", DETECTIONS: "/detections", FIX: "/fix", POSE_GRAPH: "/graph",
-    MAP_GRAPH: "/mapGraph", LINK: "/link", TRANSFORMS: "/tf_static",
+    MAP_GRAPH: "/mapGraph", LINK: "/link", TRANSFORMS: "/tf_static", IMU: "/imu",
 }  # fmt: skip
 WILD = (
     0.0, -0.0, 5e-324, -5e-324, 1e-160, 1e9, -1e9, 1.1e9, 1e12, 1e154, -1e154, 1e155, 1e300, 1e308, LARGEST, -LARGEST,
@@ -70,7 +71,7 @@ class Robot:
     """A front end with a map behind it: what it drafts is inserted, what is refused is taken back."""
 
     def __init__(self, space: str) -> None:
-        self.front_end = FrontEnd(Settings(space=space), 0, (), False)
+        self.front_end = FrontEnd(Settings(space=space, imu="/imu" if space == "space" else ""), 0, (), False)
         self.solver, self.ns = Solver(Options()), SECOND
         self.inserted = self.refused = self.unused = self.said = 0
 
@@ -140,6 +141,10 @@ def plain(type_name: str, ns: int) -> tuple[Any, list[Any], list[Any], list[Any]
     """A message with nothing wrong in it, its covariances, its points and its quaternions."""
     n = ns // SECOND
     at = (ns / SECOND, 0.0, 0.0)
+    if type_name == IMU:
+        sample = ros.imu(ns, [0.01, 0.0, 0.0, 0.1, 0.0, 9.81], "base_link", orientation=0.0)
+        covariances = [sample.angular_velocity_covariance, sample.linear_acceleration_covariance]
+        return sample, covariances, [sample.angular_velocity, sample.linear_acceleration], [sample.orientation]
     if type_name == FIX:
         fix = ros.nav_fix(ns, (48.0, 11.0 + 1e-5 * at[0], 500.0), kind=n % 4, frame="camera")
         return fix, [fix.position_covariance], [fix], []

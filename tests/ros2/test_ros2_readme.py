@@ -56,7 +56,7 @@ def test_its_commands_run(spawn: Callable[..., Process]) -> None:
     with_graph.signal(signal.SIGINT)
     assert with_graph.wait() == 0
     with ros.session(router) as bus:
-        tokens = ros.RosNode(bus, 0).wait_for_endpoints(7)
+        tokens = ros.RosNode(bus, 0).wait_for_endpoints(8)
         assert any(token.endswith("/NN/%/%/factorbus") for token in tokens)
     bridge.signal(signal.SIGINT)
     assert bridge.wait() == 0
@@ -64,7 +64,8 @@ def test_its_commands_run(spawn: Callable[..., Process]) -> None:
 
 def test_its_options_and_numbers_are_those_of_the_command() -> None:
     options_named = set(re.findall(r"`(--[a-z-]+)", README))
-    options = {option for each in (command, replay.command) for parameter in each.params for option in parameter.opts}
+    parameters = [parameter for each in (command, replay.command) for parameter in each.params]
+    options = {option for each in parameters for option in (*each.opts, *each.secondary_opts)}
     assert options_named <= options | {"--listen"}
     defaults = Settings()
     assert {defaults.odometry, *defaults.poses, *defaults.landmarks, defaults.transforms} <= set(
@@ -75,6 +76,6 @@ def test_its_options_and_numbers_are_those_of_the_command() -> None:
     assert (floors.least_m, floors.least_rad) == (0.001, 0.001)
     assert (floors.pose_m, floors.pose_rad, floors.landmark_m) == (0.01, 0.01, 0.01)
     assert (floors.closure_m, floors.closure_rad, floors.fix_m, defaults.fix_sigma_m) == (0.05, 0.02, 0.01, 5.0)
-    every = Settings(pose_graphs=("/a",), map_graphs=("/b",), links=("/c",), fixes=("/d",))
+    every = Settings(pose_graphs=("/a",), map_graphs=("/b",), links=("/c",), fixes=("/d",), imu="/e", space="space")
     named = {f"{package}/msg/{name}" for package, name in re.findall(r"`(\w+)/(\w+)`", README)}
     assert {*every.inputs().values(), TRANSFORMS} <= named

@@ -1,6 +1,7 @@
 """Names, type hashes, attachments and CDR, each against somebody else's."""
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -198,7 +199,7 @@ def test_options_arrive() -> None:
     options = BridgeOptions(
         odom="/o", poses=(), landmarks=("/a", "/b"), map_frame="map", space=True, letter="a", start="pose",
         keyframe=(1.0, 2.0), mounts=("c=1,2,3,0,0,0,1",), drift=(0.1, 0.2), tf="/tf", path="/p",
-        markers="/m", tolerance=0.5, display=2.0,
+        markers="/m", pose_out="/c", tolerance=0.5, display=2.0, imu="/i", imu_noise=(1.0, 2.0, 3.0, 4.0),
     )  # fmt: skip
     made = bridge_settings(options)
     assert (made.poses, made.landmarks, made.space, made.floors.turn_rad) == (
@@ -208,3 +209,29 @@ def test_options_arrive() -> None:
         0.2,
     )
     np.testing.assert_array_equal(made.mounts["c"].t, from_quaternion((1, 2, 3), (0, 0, 0, 1)).t)
+    assert (made.pose, made.imu, made.imu_noise.accelerometer_walk) == ("/c", "/i", 4.0)
+    with pytest.raises(BadRosName, match="velocities, biases or gravity"):
+        bridge_settings(replace(options, letter="B"))
+    with pytest.raises(BadRosName, match="--space"):
+        bridge_settings(replace(options, space=False))
+
+
+@pytest.mark.parametrize("space", ["plane", "space"])
+def test_a_pose_has_its_covariance_about_the_axes_of_the_map(space: str) -> None:
+    """It looks 0.3 rad to the left of x: what is uncertain ahead of it is so along that way."""
+    settings, key = Settings(space=space, letter="a"), symbol("a", 5)
+    flat = space == "plane"
+    row = [1.0, 2.0, 0.3] if flat else [1.0, 2.0, 3.0, 0.0, 0.0, np.sin(0.15), np.cos(0.15)]
+    keys, kind = np.array([symbol("a", 4), key, symbol("b", 9)]), "se2" if flat else "se3"
+    snapshot = Snapshot(1, 1, {kind: (keys, np.tile(row, (3, 1)))}, {kind: np.array([1, 7 * 10**9 + 5, 2])})
+    assert display.last_keyframe(settings, snapshot) == key
+    told = np.diag([4.0, 1.0, 0.1]) if flat else np.diag([4.0, 1.0, 2.0, 0.4, 0.1, 0.2])
+    data = display.certain_pose(MESSAGES, settings, snapshot, key, told)
+    read = words.PoseWithCovarianceStamped.deserialize(data)
+    c, s = np.cos(0.3), np.sin(0.3)
+    R = np.kron(np.eye(2), [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    wanted = R @ np.diag([4.0, 1.0, 0.0, 0.0, 0.0, 0.1] if flat else np.diag(told)) @ R.T
+    np.testing.assert_allclose(np.array(read.pose.covariance).reshape(6, 6), wanted, atol=1e-12)
+    assert (read.header.frame_id, read.header.stamp) == ("map", ros.stamp(7 * 10**9 + 5))
+    assert ros.plane(read.pose.pose) == pytest.approx((1.0, 2.0, 0.3))
+    assert display.last_keyframe(settings, Snapshot(1, 1, {}, {})) is None

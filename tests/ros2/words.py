@@ -37,6 +37,17 @@ class TFMessage(IdlStruct, typename="TFMessage"):
 
 
 @dataclass
+class Imu(IdlStruct, typename="Imu"):
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: array[float64, 9]
+    angular_velocity: Vector3
+    angular_velocity_covariance: array[float64, 9]
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: array[float64, 9]
+
+
+@dataclass
 class ColorRGBA(IdlStruct, typename="ColorRGBA"):
     r: float32
     g: float32
@@ -174,6 +185,21 @@ class MapGraph(IdlStruct, typename="MapGraph"):
     links: sequence[Link]
 
 
+@dataclass
+class TriggerRequest(IdlStruct, typename="Trigger_Request"):
+    structure_needs_at_least_one_member: uint8
+
+
+@dataclass
+class TriggerResponse(IdlStruct, typename="Trigger_Response"):
+    success: bool
+    message: str
+
+
+# As rmw_zenoh has it in the keys of services from Jazzy on.
+TRIGGER_HASH = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+
+
 PACKAGES = {
     "builtin_interfaces": (Time, Duration),
     "std_msgs": (Header, ColorRGBA),
@@ -183,7 +209,7 @@ PACKAGES = {
     ),
     "nav_msgs": (Odometry, Path),
     "tf2_msgs": (TFMessage,),
-    "sensor_msgs": (CompressedImage, NavSatFix, NavSatStatus),
+    "sensor_msgs": (CompressedImage, Imu, NavSatFix, NavSatStatus),
     "pose_graph_tools_msgs": (PoseGraphNode, PoseGraphEdge, PoseGraph),
     "rtabmap_msgs": (Link, MapGraph),
     "visualization_msgs": (Marker, MarkerArray, MeshFile, UVCoordinate),

@@ -9,17 +9,18 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Any
 
-from factorbus.client import Draft, Map, PendingInsert, Problem, Refused, Unavailable
+from factorbus.client import Draft, Map, PendingInsert, Problem, Refused, Snapshot, Unavailable
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta
 from factorbus.proto.symbols import symbol
 from factorbus.ros2 import display
 from factorbus.ros2.front_end import FrontEnd
-from factorbus.ros2.messages import LATEST_S, MARKERS, ODOMETRY, PATH, TRANSFORMS, Messages
+from factorbus.ros2.inertial import first_of_letter
+from factorbus.ros2.messages import LATEST_S, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
 from factorbus.ros2.names import Topic
 from factorbus.ros2.node import Node
 from factorbus.ros2.problems import BadRosMessage, Unusable
-from factorbus.ros2.settings import FRAME_LETTER, STATIC, Settings
+from factorbus.ros2.settings import FRAME_LETTER, GRAVITY_LETTER, STATIC, Settings
 from factorbus.ros2.space import SPACES
 
 log = logging.getLogger("factorbus.ros2")
@@ -49,6 +50,7 @@ class Bridge:
         self._transforms = node.publisher(self._topic(settings.transforms, TRANSFORMS, 100))
         self._path = node.publisher(self._topic(settings.path, PATH, 1))
         self._markers = node.publisher(self._topic(settings.markers, MARKERS, 1))
+        self._pose = node.publisher(self._topic(settings.pose, POSE, 1))
         self._forget = joined.estimate.on_delta(self._on_delta)
         for name, type_name in settings.inputs().items():
             self._listen(node, self._topic(name, type_name, 10))
@@ -86,14 +88,15 @@ class Bridge:
     def _topic(self, name: str, type_name: str, depth: int) -> Topic:
         return Topic(name, type_name, self._messages.hash(type_name), depth)
 
-    def _place_in_map(self) -> tuple[int, list[int], bool, int]:
+    def _place_in_map(self) -> tuple[int, list[int], bool, int, int]:
         """The first index that is free, the landmarks there are, whether a pose has to be told first, and the first
-        index that is free of frames of GNSS."""
+        indices that are free of frames of GNSS and of gravity."""
         columns = self._map.estimate.snapshot().columns
         landmarks = columns.get(SPACES[self._settings.space].point, ([],))[0]
         waits = self._settings.start == "pose" or any(len(keys) for keys, _ in columns.values())
         first, frame = (_first_free(columns, letter) for letter in (self._settings.letter, FRAME_LETTER))
-        return first, list(map(int, landmarks)), waits, frame
+        gravity = _first_free(columns, GRAVITY_LETTER, first_of_letter(self._settings.letter))
+        return first, list(map(int, landmarks)), waits, frame, gravity
 
     def _why_wait(self) -> str:
         return (
@@ -208,8 +211,21 @@ class Bridge:
             start, snapshot, stamp_ns = time.perf_counter(), mirror.snapshot(), self._front_end.stamp_ns
             self._path.publish(display.path(self._messages, self._settings, snapshot, stamp_ns))
             self._markers.publish(display.markers(self._messages, self._settings, snapshot, stamp_ns))
+            self._publish_pose(snapshot)
             drawn = snapshot.epoch, snapshot.revision
             pause_s = max(self._settings.display_s, (time.perf_counter() - start) / _DRAWING)
+
+    def _publish_pose(self, snapshot: Snapshot) -> None:
+        """The last keyframe, with the covariance that the service has of it by now."""
+        key = display.last_keyframe(self._settings, snapshot)
+        if key is None:
+            return
+        try:
+            covariance = self._map.uncertainty.covariance([key])[key]
+        except Problem as problem:  # the service is away, or the map another one
+            self._tell(problem, self._settings.pose)
+            return
+        self._pose.publish(display.certain_pose(self._messages, self._settings, snapshot, key, covariance))
 
     def _tell(self, problem: Problem, topic: str = "") -> None:
         """The first of a kind on a topic, then every hundredth."""
@@ -219,10 +235,10 @@ class Bridge:
             log.warning("%s [%s] (%d so far)", problem.message, problem.code, count)
 
 
-def _first_free(columns: Mapping[str, Any], letter: str) -> int:
-    """The index after the last key of a letter."""
+def _first_free(columns: Mapping[str, Any], letter: str, begin: int = 0) -> int:
+    """The index after the last key of a letter, of the 2⁴⁰ from `begin` on, which it is counted from."""
     first = 0
     for keys, _ in columns.values():
-        mine = keys[(keys >> 56) == ord(letter)]
-        first = max([first, *(mine - symbol(letter, 0) + 1).tolist()])
+        mine = keys - symbol(letter, begin)
+        first = max([first, *(mine[(mine >= 0) & (mine < 1 << 40)] + 1).tolist()])
     return first

@@ -58,6 +58,11 @@ class Checked:
         )
 
 
+def unknown_motion() -> F64:
+    """The covariance (6, 6) of a way of which nothing is known."""
+    return np.diag(_UNKNOWN_VARIANCE)
+
+
 def checked_covariance(topic: str, numbers: F64, axes: tuple[int, ...]) -> Checked:
     """The 6 × 6 covariance of a ROS message, of the axes that count.  Raises BadRosMessage."""
     made = _check(np.asarray(numbers, np.float64).tobytes(), axes)

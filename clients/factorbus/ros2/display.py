@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 
 from factorbus.client import Snapshot
+from factorbus.proto.arrays import F64
 from factorbus.proto.symbols import symbol
-from factorbus.ros2.geometry import Transform, quaternion
-from factorbus.ros2.messages import LATEST_S, Messages
+from factorbus.ros2.geometry import Transform, local, quaternion
+from factorbus.ros2.messages import LATEST_S, POSE, Messages
 from factorbus.ros2.settings import FRAME_LETTER, Settings
 from factorbus.ros2.space import SPACES
 
@@ -33,6 +34,32 @@ def path(messages: Messages, settings: Settings, snapshot: Snapshot, stamp_ns: i
     ]
     poses = [stamped(own, pose(messages, space.transform(row))) for own, row in zip(headers, rows[mine], strict=True)]
     return messages.write("nav_msgs/msg/Path", messages.type_of("nav_msgs/msg/Path")(header, poses))
+
+
+def last_keyframe(settings: Settings, snapshot: Snapshot) -> int | None:
+    """The key of this robot's last pose in an estimate, if it has one."""
+    keys, _ = snapshot.columns.get(SPACES[settings.space].pose, (np.empty(0, np.int64), None))
+    mine = keys[(keys >= symbol(settings.letter, 0)) & (keys < symbol(settings.letter, 0) + (1 << 56))]
+    return int(mine.max()) if len(mine) else None
+
+
+def certain_pose(messages: Messages, settings: Settings, snapshot: Snapshot, key: int, covariance: F64) -> bytes:
+    """A keyframe as a geometry_msgs/PoseWithCovarianceStamped, as CDR; covariance: of its tangent space.
+
+    ROS has it about the fixed axes of the map: x y z, and the rotation about them.  What a plane has no axis for is 0.
+    """
+    space = SPACES[settings.space]
+    keys, rows = snapshot.columns[space.pose]
+    at = int(np.flatnonzero(keys == key)[0])
+    T = space.transform(rows[at])
+    whole = np.zeros((6, 6))
+    whole[np.ix_(space.axes, space.axes)] = covariance
+    stamps = snapshot.stamps.get(space.pose, np.full(len(keys), -1, np.int64))
+    stamp = int(stamps[at]) if 0 <= stamps[at] < (LATEST_S + 1) * 10**9 else 0
+    types = messages.type_of
+    numbers = local(whole, T.R.T).ravel()
+    made = types("geometry_msgs/msg/PoseWithCovariance")(pose(messages, T), numbers)
+    return messages.write(POSE, types(POSE)(messages.header(stamp, settings.map_frame), made))
 
 
 def markers(messages: Messages, settings: Settings, snapshot: Snapshot, stamp_ns: int) -> bytes:

@@ -17,22 +17,24 @@ from factorbus.proto.arrays import F64
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.certainty import information
 from factorbus.ros2.closures import GraphClosures, NodePlace
+from factorbus.ros2.continuity import LONGEST_S, Continues, ToldOdometry
 from factorbus.ros2.fixes import Antenna, GnssFixes, read_fix
 from factorbus.ros2.geometry import Transform, carried, local
 from factorbus.ros2.graphs import heard_graph
+from factorbus.ros2.inertial import InertialChain, Moment
 from factorbus.ros2.message_parts import Notes, stamp_ns_of, transform_of
-from factorbus.ros2.messages import DETECTIONS, FIX, ODOMETRY, POSE
+from factorbus.ros2.messages import DETECTIONS, FIX, IMU, ODOMETRY, POSE
 from factorbus.ros2.mounts import Mounts
 from factorbus.ros2.observations import LandmarkReader, cross_matrix
+from factorbus.ros2.odometry import OdometryReader
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
 from factorbus.ros2.track import KeyframePlace, OdometryTrack, Sample
 
 _WAITING = 256
-_BASE_FRAME = "base_link"  # of odometry that does not say whose it is, as REP 105 has it
 _STILL = 1e-12  # metres and radians: no way at all
-_GAP_S = 60.0  # beyond that nobody knows where between two odometries the robot was
+_STALE_NS = 10**9  # what is later than a clock that was set back by that is of the former clock
 _ELSEWHERE_M, _ELSEWHERE_RAD, _ELSEWHERE_SHARE = 1.0, 0.35, 0.1
 
 # What uses a message once odometry is there, of (draft, its stamp, its topic, itself).
@@ -44,39 +46,58 @@ class FrontEnd:
     (topic, what was done); the bridge empties both.
 
     first: index of the first key.  landmarks: keys that the map has already.  wait_for_pose: begin with a pose.
-    frame: index of the key of GNSS's frame.
+    frame, gravity: index of the key of GNSS's frame, and of gravity.
     """
 
     def __init__(
-        self, settings: Settings, first: int, landmarks: Iterable[int], wait_for_pose: bool, frame: int = 0
-    ) -> None:
+        self, settings: Settings, first: int, landmarks: Iterable[int], wait_for_pose: bool, frame: int = 0,
+        gravity: int = 0,
+    ) -> None:  # fmt: skip
         self._settings, self._space, self._floors = settings, SPACES[settings.space], settings.floors
         self._track, self._notes = OdometryTrack(), Notes()
         self._waiting: deque[tuple[int, str, Any, _Use]] = deque(maxlen=_WAITING)
+        self._newest: dict[str, int] = {}
+        self._odometry = OdometryReader(settings, self._notes)
         self._mounts = Mounts(settings.mounts)
         self._observations = LandmarkReader(settings, self._mount, self._notes)
         self._closures = GraphClosures(settings, self._try_node_place, self._notes)
         self._fixes = GnssFixes(settings, frame, self._notes)
+        self._inertial = InertialChain(settings, self._try_mount, self._track.moved_m, gravity, self._notes)
         self.refused, self.remarks = self._notes.refused, self._notes.remarks
-        self.odometry_frame, self.base_frame = "", ""
-        self.begin_again(first, landmarks, wait_for_pose, frame)
+        self.begin_again(first, landmarks, wait_for_pose, frame, gravity)
 
-    def begin_again(self, first: int, landmarks: Iterable[int], wait_for_pose: bool, frame: int = 0) -> None:
+    def begin_again(
+        self, first: int, landmarks: Iterable[int], wait_for_pose: bool, frame: int = 0, gravity: int = 0
+    ) -> None:
         """As new, for a map that is another one."""
         self._next, self._landmarks, self._wait_for_pose = first, set(landmarks), wait_for_pose
         self._T_map_odom = Transform(np.eye(3), np.zeros(3))
         self._is_compared = False
         self._track.forget()
         self._waiting.clear()
+        self._newest.clear()
+        self._odometry.forget()
         self._closures.forget()
         self._fixes.forget(frame)
+        self._inertial.forget(gravity)
 
     def rewind(self, present: Callable[[int], bool]) -> None:
         """An insert was refused: go on from the last keyframe that is in the map."""
         self._track.rewind(present)
         self._closures.rewind(present)
         self._fixes.rewind(present)
+        self._inertial.rewind(present)
         self._landmarks = {key for key in self._landmarks if present(key)}
+
+    @property
+    def odometry_frame(self) -> str:
+        """Of the odometry that was read; empty before the first."""
+        return self._odometry.frame
+
+    @property
+    def base_frame(self) -> str:
+        """The robot's, likewise."""
+        return self._odometry.base_frame
 
     @property
     def stamp_ns(self) -> int:
@@ -98,6 +119,10 @@ class FrontEnd:
 
     def open_ends(self) -> Iterator[tuple[str, str]]:
         """(topic, what still waits), for people, where a recording ends."""
+        if text := self._odometry.open_ends():
+            yield self._settings.odometry, text
+        if text := self._inertial.open_ends():
+            yield self._settings.imu, text
         yield from self._closures.open_ends()
         yield from ((" and ".join(self._settings.fixes), text) for text in self._fixes.open_ends())
 
@@ -109,6 +134,8 @@ class FrontEnd:
             return self.pose(topic, message)
         if type_name == DETECTIONS:
             return self.detections(topic, message)
+        if type_name == IMU:
+            return self.imu(topic, message)
         return self.fix(topic, message) if type_name == FIX else self.graph(topic, type_name, message)
 
     def static(self, topic: str, message: Any) -> None:
@@ -117,17 +144,45 @@ class FrontEnd:
 
     def odometry(self, message: Any) -> Draft | None:
         """A nav_msgs/Odometry.  Raises BadRosMessage: it is not used."""
-        sample = self._sample(message)
         draft = Draft()
-        keyframe = self._track.keyframe
+        for told, how in self._odometry.read(message, self.stamp_ns):
+            self._advance(draft, told, how)
+        return None if _is_empty(draft) else draft
+
+    def _advance(self, draft: Draft, told: ToldOdometry, how: Continues) -> None:
+        sample, keyframe = self._add(told, how), self._track.keyframe
         if keyframe is None and not self._wait_for_pose:
             row = self._space.row(sample.T_odom_base)
             draft.variable(self._space.pose, self._mark(sample), row, fixed=True, stamp=sample.stamp_ns)
-        elif keyframe is not None and self._is_far(sample):
+            self._mark_moment(sample)
+        elif keyframe is not None and (how is Continues.ANEW or self._is_far(sample)):
             self._add_keyframe(draft, sample)
         self._use_what_waited(draft)
         self._closures.advance(draft)
-        return None if _is_empty(draft) else draft
+        self._inertial.advance(draft)
+
+    def _add(self, told: ToldOdometry, how: Continues) -> Sample:
+        last = self._track.latest
+        pose = told.stamp_ns, told.T_odom_base, told.covariance
+        if last is not None and told.stamp_ns <= last.stamp_ns:
+            self._set_clock_back(told.stamp_ns)
+            if how is Continues.CLOCK_BACK:
+                return self._track.add_by_new_clock(*pose, told.unknown)
+        if how is Continues.ANEW and last is not None:
+            T_new_old = told.T_odom_base @ last.T_odom_base.inverse()
+            self._T_map_odom @= T_new_old.inverse()
+            return self._track.add_anew(*pose, told.unknown)
+        return self._track.add(*pose, told.twist, told.unknown)
+
+    def _set_clock_back(self, stamp_ns: int) -> None:
+        """What waits for a time that the former clock had is not used."""
+        self._newest.clear()
+        self._inertial.set_clock_back(stamp_ns)
+        waiting, last_ns = list(self._waiting), stamp_ns + _STALE_NS
+        self._waiting = deque((each for each in waiting if each[0] <= last_ns), _WAITING)
+        for at_ns, topic, _, _ in (each for each in waiting if each[0] > last_ns):
+            wanted = f"one by the clock as it was set back to, {stamp_ns} ns"
+            self.refused.append(BadRosMessage(topic, f"a stamp of {at_ns} ns", wanted))
 
     def pose(self, topic: str, message: Any) -> Draft | None:
         """A geometry_msgs/PoseWithCovarianceStamped in the map's frame.  Raises BadRosMessage."""
@@ -144,33 +199,23 @@ class FrontEnd:
         """A sensor_msgs/NavSatFix.  Raises BadRosMessage."""
         return self._take(topic, message, self._use_fix)
 
+    def imu(self, topic: str, message: Any) -> Draft | None:
+        """A sensor_msgs/Imu.  Raises BadRosMessage."""
+        self._inertial.hear(topic, message)
+        draft = Draft()
+        self._inertial.advance(draft)
+        return None if _is_empty(draft) else draft
+
     def graph(self, topic: str, type_name: str, message: Any) -> Draft | None:
         """A pose_graph_tools_msgs/PoseGraph, rtabmap_msgs/MapGraph or rtabmap_msgs/Link.  Raises BadRosMessage."""
         draft = Draft()
         self._closures.hear(topic, heard_graph(topic, type_name, message, self._settings.rotation_first), draft)
         return None if _is_empty(draft) else draft
 
-    def _sample(self, message: Any) -> Sample:
-        topic = self._settings.odometry
-        frames = message.header.frame_id, message.child_frame_id or _BASE_FRAME
-        if self.base_frame and frames != (self.odometry_frame, self.base_frame):
-            raise BadRosMessage(topic, f"frames {frames}", f"{self.odometry_frame, self.base_frame} as before")
-        if not message.header.frame_id:
-            raise BadRosMessage(topic, f"frames {frames}", "the name of the odometry's frame in the message's header")
-        if not message.child_frame_id and self._track.latest is None:
-            self._notes.remark(topic, f"no child_frame_id: the robot's frame is taken to be {_BASE_FRAME!r}")
-        stamp_ns = stamp_ns_of(topic, message.header.stamp)
-        if self._track.latest is not None and stamp_ns <= self.stamp_ns:
-            raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", f"one after the last, {self.stamp_ns} ns")
-        T = self._space.fitted(transform_of(topic, message.pose.pose))
-        covariance = self._notes.checked(topic, "pose", message.pose.covariance, self._space.axes)
-        twist = self._notes.checked(topic, "twist", message.twist.covariance, self._space.axes)
-        self.odometry_frame, self.base_frame = frames
-        known, unknown = local(covariance.known, T.R), local(covariance.spread, T.R)
-        return self._track.add(stamp_ns, T, known, twist.whole, unknown)
-
     def _is_far(self, sample: Sample) -> bool:
         T = self._track.place_of(sample).T
+        if self._inertial.is_long():
+            return True
         return float(np.linalg.norm(T.t)) >= self._settings.keyframe_m or T.angle() >= self._settings.keyframe_rad
 
     def _mark(self, sample: Sample) -> int:
@@ -179,6 +224,12 @@ class FrontEnd:
         self._track.mark(key, sample)
         return key
 
+    def _mark_moment(self, sample: Sample) -> None:
+        """Of the last keyframe, for the IMU."""
+        if self._settings.imu and (keyframe := self._track.keyframe) is not None:
+            T_map_base = self._T_map_odom @ keyframe.T_odom_base
+            self._inertial.mark(Moment(keyframe.key, sample.stamp_ns, T_map_base))
+
     def _add_keyframe(self, draft: Draft, sample: Sample) -> None:
         place = self._track.place_of(sample)
         weight = information(self._space.residual(self._floored_way(place)))
@@ -186,6 +237,7 @@ class FrontEnd:
         draft.variable(self._space.pose, key, stamp=sample.stamp_ns)
         measured = self._space.row(place.T)
         draft.factor(f"between_{self._space.pose}", (place.keyframe.key, key), measured, information=weight)
+        self._mark_moment(sample)
 
     def _floored_way(self, place: KeyframePlace) -> F64:
         floors, metres, radians = self._floors, float(np.linalg.norm(place.T.t)), place.T.angle()
@@ -197,7 +249,10 @@ class FrontEnd:
 
     def _take(self, topic: str, message: Any, use: _Use) -> Draft | None:
         stamp_ns = stamp_ns_of(topic, message.header.stamp)
-        if self._track.latest is None or stamp_ns > self.stamp_ns:
+        # What is before the last of its topic waits, too: the next odometry tells whether the clock was set back.
+        newest = self._newest.get(topic, stamp_ns)
+        self._newest[topic] = max(newest, stamp_ns)
+        if self._track.latest is None or stamp_ns > self.stamp_ns or stamp_ns < newest:
             self._waiting.append((stamp_ns, topic, message, use))
             return None
         draft = Draft()
@@ -218,9 +273,9 @@ class FrontEnd:
     def _check_covered(self, stamp_ns: int, topic: str) -> None:
         if not self._track.covers(stamp_ns):
             raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", "one for which odometry is still remembered")
-        if (gap_s := self._track.gap_s(stamp_ns)) > _GAP_S:
+        if (gap_s := self._track.gap_s(stamp_ns)) > LONGEST_S:
             found = f"a stamp of {stamp_ns} ns, where odometry has a gap of {gap_s:.4g} s"
-            raise BadRosMessage(topic, found, f"odometry before and after it, at most {_GAP_S:g} s apart")
+            raise BadRosMessage(topic, found, f"odometry before and after it, at most {LONGEST_S:g} s apart")
 
     def _use_pose(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
         T_map_base = self._space.fitted(transform_of(topic, message.pose.pose))
@@ -243,6 +298,7 @@ class FrontEnd:
         if begins:
             self._T_map_odom = T_map_keyframe @ place.keyframe.T_odom_base.inverse()
             draft.variable(self._space.pose, place.keyframe.key, row, stamp=sample.stamp_ns)
+            self._mark_moment(sample)
         weight = information(self._space.residual(covariance))
         draft.factor(f"prior_{self._space.pose}", (place.keyframe.key,), row, information=weight)
 
@@ -285,6 +341,9 @@ class FrontEnd:
             variance = float(np.linalg.eigvalsh(J @ self._floored_way(place) @ J.T)[-1])
         antenna = Antenna(place.keyframe.key, lever, T.R @ lever + T.t, variance)
         self._fixes.use(topic, fix, antenna, draft)
+
+    def _try_mount(self, frame: str) -> Transform | None:
+        return self._mounts.try_mount(self.base_frame, frame)
 
     def _lever(self, topic: str, frame: str) -> F64:
         """Where the antenna is on the robot; in its middle where nothing says where its frame is."""

@@ -14,6 +14,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from factorbus.ros2.problems import BadRosMessage
+from factorbus.ros2.trigger import register_trigger
 from factorbus.wording import counted
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -104,6 +105,7 @@ class Messages:
         self._store = get_typestore(DISTRIBUTIONS[distribution])
         self._hashed = distribution != "humble"
         register_further_types(self._store)
+        register_trigger(self._store)
 
     def hash(self, type_name: str) -> str:
         """RIHS01_ and the SHA-256 of the type's description (REP 2016), or what stands for it."""

@@ -49,12 +49,17 @@ class NodeName:
         return self._place(0, "NN")
 
     def endpoint_token(self, number: int, kind: str, topic: Topic, kept: bool = False) -> str:
-        """Alive while the endpoint is: what `ros2 topic list` goes by.  kind: MP publishes, MS subscribes.
+        """Alive while the endpoint is: what `ros2 topic list` goes by.  kind: MP publishes, MS subscribes, SS serves.
 
         kept: with what was published before (transient local).
         """
         words = (_mangled(topic.name), dds_type(topic.type), topic.hash, quality(topic.depth, kept))
         return "/".join((self._place(number, kind), *words))
+
+    @property
+    def full_name(self) -> str:
+        """As ROS has it, what stands for `~`: /robot1/factorbus."""
+        return f"{self.namespace.rstrip('/')}/{self.name}"
 
     def _place(self, number: int, kind: str) -> str:
         enclave = "%"  # none
@@ -82,6 +87,14 @@ def gid(token: str) -> bytes:
 def attachment(sequence: int, stamp_ns: int, of: bytes) -> bytes:
     """What goes with every message: which of this endpoint it is, from 1 on, when it was sent, whose it is."""
     return _ATTACHMENT.pack(sequence, stamp_ns, _GID_BYTES, of)
+
+
+def read_attachment(data: bytes) -> tuple[int, bytes]:
+    """(number, gid) of one; zeros of what is none, as of a caller that is no ROS node."""
+    if len(data) != _ATTACHMENT.size:
+        return 0, bytes(_GID_BYTES)
+    number, _, _, of = _ATTACHMENT.unpack(data)
+    return number, of
 
 
 def _mangled(name: str) -> str:

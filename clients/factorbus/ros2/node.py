@@ -10,7 +10,7 @@ from zenoh.ext import HistoryConfig, declare_advanced_subscriber
 from zenoh.handlers import Callback
 
 from factorbus.client.link import open_session
-from factorbus.ros2.names import NodeName, Topic, attachment, gid
+from factorbus.ros2.names import NodeName, Topic, attachment, gid, read_attachment
 
 
 class Node:
@@ -53,6 +53,22 @@ class Node:
             self._declared.append(self._session.declare_subscriber(key, handler))
         self._announce("MS", topic, kept)
 
+    @property
+    def full_name(self) -> str:
+        """With its namespace."""
+        return self._name.full_name
+
+    def serve(self, topic: Topic, hear: Callable[["ServiceCall"], None]) -> None:
+        """From now on every call of a service goes to `hear`, on Zenoh's thread: it may only hand over."""
+        key = topic.key(self._domain)
+
+        def on_query(query: zenoh.Query) -> None:
+            hear(ServiceCall(query, key))
+
+        handler = Callback(on_query, indirect=False)
+        self._declared.append(self._session.declare_queryable(key, handler, complete=True))
+        self._announce("SS", topic)
+
     def close(self) -> None:
         """Leave: tokens first, so that nobody counts on what is going."""
         for declared in (*self._tokens, *self._declared):
@@ -64,6 +80,19 @@ class Node:
         token = self._name.endpoint_token(len(self._tokens), kind, topic, kept)
         self._tokens.append(self._session.liveliness().declare_token(token))
         return token
+
+
+class ServiceCall:
+    """A call that waits for its answer, which has the number and the gid of the call, as rmw_zenoh's clients want."""
+
+    def __init__(self, query: zenoh.Query, key: str) -> None:
+        self._query, self._key = query, key
+        self._number, self._gid = read_attachment(query.attachment.to_bytes() if query.attachment else b"")
+
+    def reply(self, data: bytes) -> None:
+        """CDR as it goes out; the caller waits no longer."""
+        self._query.reply(self._key, data, attachment=attachment(self._number, time.time_ns(), self._gid))
+        self._query.drop()
 
 
 class Publisher:

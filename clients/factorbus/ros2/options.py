@@ -3,6 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+# Of gyroscopes and accelerometers (rad/s/√Hz, m/s²/√Hz) and the walks of their biases (per √s): EuRoC's ADIS16448, by
+# the sensor.yaml of that data set.
+USUAL_IMU_NOISE = (1.6968e-4, 2.0e-3, 1.9393e-5, 3.0e-3)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotOptions:
@@ -10,6 +14,7 @@ class RobotOptions:
 
     odom, poses, landmarks: topics.  space: poses in space.  keyframe: metres, radians.
     mounts: FRAME=x,y,z,qx,qy,qz,qw.  drift: per metre, per radian.
+    imu: a topic.  imu_noise: as of `ImuNoise`; without, that of EuRoC's ADIS16448.
     pose_graphs, map_graphs, links, fixes: topics.  fix_sigma: metres.  robot_id: in pose graphs; None: the first.
     """
 
@@ -30,17 +35,20 @@ class RobotOptions:
     fix_sigma: float = 5.0
     robot_id: int | None = None
     rotation_first: bool = False
+    imu: str = ""
+    imu_noise: tuple[float, float, float, float] = USUAL_IMU_NOISE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BridgeOptions(RobotOptions):
     """Those of `factorbus ros2`, and what it publishes.
 
-    tf, path, markers: topics.  tolerance, display: seconds.
+    tf, path, markers, pose_out: topics.  tolerance, display: seconds.
     """
 
     tf: str
     path: str
     markers: str
+    pose_out: str
     tolerance: float
     display: float

@@ -88,8 +88,7 @@ class _Reading:
 
     def __init__(self, recording: RobotRecording, settings: Settings) -> None:
         self._recording, self._inputs = recording, settings.inputs()
-        # Of all robots, and this robot's own.
-        names = (STATIC, _namespaced(settings.odometry)[0] + STATIC)
+        names = _frames_of(settings)
         self._statics = [topic.name for topic in _of_type(recording, TRANSFORMS) if topic.name in names]
         self._front_end = FrontEnd(settings, 0, (), settings.start == "pose")
         self.steps, self.used, self.left_out = RecordedSteps(), Counter[str](), Counter[str]()
@@ -175,8 +174,17 @@ def _with_topics(recording: RobotRecording, settings: Settings) -> tuple[Setting
     if not settings.poses and (found := _of_type(recording, POSE)):
         takes = " ".join(f"--pose {topic.name}" for topic in found)
         notes.append(f"poses left out: {_listed(found)}; {takes} takes them, and --start pose begins with the first")
-    if found := _of_type(recording, IMU):
-        notes.append(f"left out, as there is no factor of it from ROS: {_listed(found)} ({IMU})")
+    names = _frames_of(settings)
+    if found := [topic for topic in _of_type(recording, TRANSFORMS) if topic.name.endswith(STATIC)]:
+        others = [topic for topic in found if topic.name not in names]
+        if others:
+            notes.append(f"frames of sensors left out: {_listed(others)}; those of {' and '.join(names)} are read")
+    if recording.unread:
+        shown = ", ".join(recording.unread[:_SHOWN])
+        notes.append(f"left out, as the form of their messages is not known or not one: {shown}")
+    if not settings.imu and (found := _of_type(recording, IMU)):
+        takes = f"--space --imu {found[0].name} takes its raw samples"
+        notes.append(f"IMU left out: {_listed(found)}; {takes}, where odometry was not made of them already")
     return settings, notes
 
 
@@ -225,6 +233,11 @@ def _namespaced(topic: str) -> tuple[str, str]:
     """("/robot1", "odom") of /robot1/odom; ("", "odom") of /odom."""
     first, _, rest = topic.removeprefix("/").partition("/")
     return (f"/{first}", rest) if rest else ("", first)
+
+
+def _frames_of(settings: Settings) -> list[str]:
+    """Topics of where sensors are: of all robots, and of this one."""
+    return list(dict.fromkeys((STATIC, _namespaced(settings.odometry)[0] + STATIC)))
 
 
 def _with_odometry(recording: RobotRecording, settings: Settings) -> tuple[Settings, str]:

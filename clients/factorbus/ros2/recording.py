@@ -41,6 +41,7 @@ class RecordedTopic:
 
 class _Source(Protocol):
     topics: list[RecordedTopic]
+    unread: list[str]
 
     def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
         """Of these topics, in the order in which they were recorded."""
@@ -66,6 +67,11 @@ class RobotRecording:
     def notes(self) -> list[str]:
         """How it was opened where not as a whole, and where the last reading of it ended before its end."""
         return [note for note in (self._opened, self._damaged) if note]
+
+    @property
+    def unread(self) -> list[str]:
+        """Topics that nothing is read of, as the form of their messages is not known."""
+        return sorted(self._source.unread)
 
     @property
     def topics(self) -> list[RecordedTopic]:
@@ -123,10 +129,14 @@ class RobotRecording:
 
     def _begun(self, path: Path, first: Exception) -> _Source:
         """An MCAP file that cannot be opened as a whole, without its end for example, from its beginning."""
-        from factorbus.ros2.unfinished_mcap import UnfinishedMcap
+        from factorbus.ros2.unfinished_mcap import NothingWhole, UnfinishedMcap
 
         try:
             source = UnfinishedMcap(path)
+        except NothingWhole as nothing:
+            found = f"its {path.stat().st_size} bytes end {nothing}, so no message in it is whole"
+            wanted = "more of the file; a recorder writes a chunk when it is full (ros2 bag record: --max-cache-size)"
+            raise BadRecording(self.path, found, wanted) from None
         except Exception as fault:
             raise BadRecording(self.path, f"it cannot be read ({_told(fault)})", "an MCAP file") from None
         if not source.topics:
@@ -147,6 +157,7 @@ class _Whole:
             for name, info in self._reader.topics.items()
             if info.msgtype
         ]
+        self.unread = [name for name, info in self._reader.topics.items() if not info.msgtype]
 
     def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
         """As in `RobotRecording`."""

@@ -3,13 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from factorbus.client.imu import ImuNoise
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.geometry import Transform, from_quaternion
-from factorbus.ros2.messages import DETECTIONS, FIX, LINK, MAP_GRAPH, ODOMETRY, POSE, POSE_GRAPH
-from factorbus.ros2.options import BridgeOptions, RobotOptions
+from factorbus.ros2.messages import DETECTIONS, FIX, IMU, LINK, MAP_GRAPH, ODOMETRY, POSE, POSE_GRAPH
+from factorbus.ros2.options import USUAL_IMU_NOISE, BridgeOptions, RobotOptions
 from factorbus.ros2.problems import BadRosName
 
 USUAL_POSES, USUAL_LANDMARKS = ("/initialpose",), ("/detections",)
+# Of the keys of what an IMU adds: velocities, biases, gravity.
+INERTIAL_LETTERS = VELOCITY_LETTER, BIAS_LETTER, GRAVITY_LETTER = "V", "B", "G"
 # Of the key of the map's pose in the frame of GNSS, and the topic of the frames of sensors.
 FRAME_LETTER, STATIC = "f", "/tf_static"
 LANDMARK_LETTER = "l"
@@ -55,8 +58,10 @@ class Settings:
     map_graphs: tuple[str, ...] = ()
     links: tuple[str, ...] = ()
     fixes: tuple[str, ...] = ()
+    imu: str = ""
     path: str = "/factorbus/path"
     markers: str = "/factorbus/markers"
+    pose: str = "/factorbus/pose"
     transforms: str = "/tf"
     map_frame: str = "map"
     space: str = "plane"
@@ -68,6 +73,7 @@ class Settings:
     tolerance_s: float = 0.1
     display_s: float = 1.0
     fix_sigma_m: float = 5.0
+    imu_noise: ImuNoise = field(default_factory=lambda: ImuNoise(*USUAL_IMU_NOISE))
     robot_id: int | None = None
     rotation_first: bool = False
     mounts: Mapping[str, Transform] = field(default_factory=dict)
@@ -78,7 +84,8 @@ class Settings:
         odometry = {self.odometry: ODOMETRY} if self.odometry else {}
         groups = ((self.poses, POSE), (self.landmarks, DETECTIONS), (self.pose_graphs, POSE_GRAPH),
                   (self.map_graphs, MAP_GRAPH), (self.links, LINK), (self.fixes, FIX))  # fmt: skip
-        return odometry | {name: type_name for names, type_name in groups for name in names}
+        made = odometry | {name: type_name for names, type_name in groups for name in names}
+        return made | ({self.imu: IMU} if self.imu else {})
 
 
 def bridge_settings(options: BridgeOptions) -> Settings:
@@ -91,6 +98,7 @@ def bridge_settings(options: BridgeOptions) -> Settings:
         landmarks=given.landmarks or USUAL_LANDMARKS,
         path=options.path,
         markers=options.markers,
+        pose=options.pose_out,
         transforms=options.tf,
         tolerance_s=options.tolerance,
         display_s=options.display,
@@ -104,6 +112,10 @@ def robot_settings(options: RobotOptions) -> Settings:
         raise BadRosName("the letter", options.letter, f"another one: {FRAME_LETTER}0 is the frame of GNSS")
     if options.letter == LANDMARK_LETTER:
         raise BadRosName("the letter", options.letter, "another one: this is that of landmarks")
+    if options.imu and options.letter in INERTIAL_LETTERS:
+        raise BadRosName("the letter", options.letter, "another one: this is that of velocities, biases or gravity")
+    if options.imu and not options.space:
+        raise BadRosName("the IMU", options.imu, "poses in space, --space: in the plane there is no inertial factor")
     return Settings(
         odometry=options.odom,
         poses=tuple(options.poses),
@@ -113,6 +125,8 @@ def robot_settings(options: RobotOptions) -> Settings:
         links=tuple(options.links),
         fixes=tuple(options.fixes),
         fix_sigma_m=options.fix_sigma,
+        imu=options.imu,
+        imu_noise=ImuNoise(*options.imu_noise),
         robot_id=options.robot_id,
         rotation_first=options.rotation_first,
         map_frame=options.map_frame,

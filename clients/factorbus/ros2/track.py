@@ -1,6 +1,7 @@
 """What odometry tells: where the robot was at any time of late, and how certain the way from its last keyframe is."""
 
 import bisect
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,6 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorbus.proto.arrays import F64
+from factorbus.ros2.certainty import unknown_motion
+from factorbus.ros2.continuity import LONGEST_S
 from factorbus.ros2.geometry import Transform, between, carried
 
 _KEPT = 4096
@@ -85,6 +88,45 @@ class OdometryTrack:
         self._samples.append(made)
         return made
 
+    def add_anew(self, stamp_ns: int, T_odom_base: Transform, covariance: F64, unknown: F64) -> Sample:
+        """The first of an odometry that began anew: the robot is taken to be where it was, as far as that is known.
+
+        What came before is in the frame of the new odometry from now on.
+        """
+        last = self.latest
+        if last is not None:
+            T_new_old = T_odom_base @ last.T_odom_base.inverse()
+            kept = {each.key: each for each in (*(one.keyframe for one in self._samples), *self._keyframes) if each}
+            moved = {key: replace(each, T_odom_base=T_new_old @ each.T_odom_base) for key, each in kept.items()}
+            self._keyframes = deque((moved[each.key] for each in self._keyframes), maxlen=_KEYFRAMES)
+            self._samples = deque(
+                (
+                    replace(
+                        each,
+                        T_odom_base=T_new_old @ each.T_odom_base,
+                        keyframe=moved[each.keyframe.key] if each.keyframe else None,
+                    )
+                    for each in self._samples
+                ),
+                maxlen=_KEPT,
+            )
+            if stamp_ns <= last.stamp_ns:  # by another clock, too
+                self._samples.clear()
+        way = unknown_motion() + (last.way if last is not None else 0.0)
+        made = Sample(stamp_ns, T_odom_base, covariance, self.keyframe, way, unknown)
+        self._samples.append(made)
+        return made
+
+    def add_by_new_clock(self, stamp_ns: int, T_odom_base: Transform, covariance: F64, unknown: F64) -> Sample:
+        """The first of a clock that was set back: what came before has no time any more, but its keyframe counts."""
+        last, way = self.latest, np.zeros((6, 6))
+        if last is not None:
+            way = carried(last.way, last.T_odom_base.inverse() @ T_odom_base)
+        self._samples.clear()
+        made = Sample(stamp_ns, T_odom_base, covariance, self.keyframe, way, unknown)
+        self._samples.append(made)
+        return made
+
     def mark(self, key: int, at: Sample) -> Keyframe:
         """Make a sample a keyframe; those after it belong to it."""
         way = at.way if at.keyframe is self.keyframe else np.zeros((6, 6))
@@ -112,6 +154,13 @@ class OdometryTrack:
     def covers(self, stamp_ns: int) -> bool:
         """Not before the first odometry that is kept."""
         return bool(self._samples) and stamp_ns >= self._samples[0].stamp_ns
+
+    def moved_m(self, begin_ns: int, end_ns: int) -> float:
+        """How far it is from one place to another by odometry; infinite where that is not remembered."""
+        if not self.covers(begin_ns):
+            return math.inf
+        first, last = (self._interpolated(each)[1] for each in (begin_ns, end_ns))
+        return float(np.linalg.norm(last.t - first.t))
 
     def gap_s(self, stamp_ns: int) -> float:
         """How far apart the odometries before and after it are, seconds; 0 at one, and after the last."""
@@ -162,7 +211,7 @@ def _since(keyframe: Keyframe, at: Sample, sample: Sample) -> Sample:
 
 def _extended(last: Sample, T_odom_base: Transform, stamp_ns: int, twist: F64) -> F64:
     """The way's covariance one sample on: that so far, carried, and Σ Δt² of the new one."""
-    seconds = 1e-9 * (stamp_ns - last.stamp_ns)
+    seconds = min(1e-9 * (stamp_ns - last.stamp_ns), LONGEST_S)
     return carried(last.way, last.T_odom_base.inverse() @ T_odom_base) + seconds**2 * twist
 
 

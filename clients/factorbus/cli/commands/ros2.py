@@ -2,8 +2,9 @@
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import click
 
@@ -21,13 +22,18 @@ _SWITCH_S = 0.0005
 
 @dataclass(frozen=True, slots=True)
 class NodeOptions:
-    """Our node in the robot's ROS graph: the router to join (None: as --connect), domain, distribution, its names."""
+    """Our node in the robot's ROS graph: the router to join (None: as --connect), domain, distribution, its names.
+
+    services: whether it has some.  save_folder: where what they save goes.
+    """
 
     ros: str | None
     domain: int
     distro: str
     namespace: str
     node_name: str
+    services: bool
+    save_folder: Path | None
 
 
 @click.command()
@@ -49,7 +55,17 @@ class NodeOptions:
     "--markers", default="/factorbus/markers", show_default=True, metavar="TOPIC",
     help="Where visualization_msgs/MarkerArray goes.",
 )  # fmt: skip
+@click.option(
+    "--pose-out", default="/factorbus/pose", show_default=True, metavar="TOPIC",
+    help="Where geometry_msgs/PoseWithCovarianceStamped of the last keyframe goes.",
+)  # fmt: skip
 @click.option("--tolerance", default=0.1, show_default=True, metavar="SECONDS", help="Transforms are stamped ahead.")
+@click.option(
+    "--services/--no-services", default=True, show_default=True, help="settle, save, fork, repair, as Trigger."
+)
+@click.option(
+    "--save-folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Where the service saves."
+)
 @click.option("--display", default=1.0, show_default=True, metavar="SECONDS", help="Least time between paths.")
 @zenoh_option
 @log_option
@@ -67,9 +83,10 @@ def command(
 ) -> None:
     """Join a robot that speaks ROS 2 over Zenoh (rmw_zenoh) to MAP. No ROS is needed on this side.
 
-    Reads odometry, poses with covariance, landmark detections, loop closures of a front end's graph and fixes of GNSS;
-    publishes the transform from map to odometry after every step, a path and markers. Prints `ready` when the robot can
-    begin. Until Ctrl-C.
+    Reads odometry, poses with covariance, landmark detections, loop closures of a front end's graph, fixes of GNSS and
+    samples of an IMU; publishes the transform from map to odometry after every step, a path and markers. Has services
+    of the type std_srvs/Trigger: /factorbus/settle, save, fork, repair, accept and reject. Prints `ready` when the
+    robot can begin. Until Ctrl-C.
 
     \b
     factorbus ros2 warehouse
@@ -84,6 +101,7 @@ def command(
     from factorbus.ros2.bridge import Bridge
     from factorbus.ros2.messages import Messages
     from factorbus.ros2.node import open_node
+    from factorbus.ros2.services import MapServices
     from factorbus.ros2.settings import bridge_settings
 
     begin_logging(log_form, quiet)
@@ -103,9 +121,14 @@ def command(
             zenoh if ros is None else "",
         ) as node,
     ):
-        bridge = Bridge(joined, node, Messages(as_node.distro), settings)
-        click.echo(f"{READY}{ros or endpoint}")
-        bridge.run(stop)
+        messages = Messages(as_node.distro)
+        bridge = Bridge(joined, node, messages, settings)
+        with ExitStack() as serving:
+            if as_node.services:
+                services = MapServices(bus, joined, as_node.save_folder, settings.letter)
+                serving.enter_context(services.offer(node, messages))
+            click.echo(f"{READY}{ros or endpoint}")
+            bridge.run(stop)
         click.echo(" ".join(f"{name}={count}" for name, count in sorted(bridge.counts.items())), err=True)
 
 

@@ -116,16 +116,21 @@ class Driven:
     landmarks: int = 0
     factors: int = 0
     steps: list[DriveStep] = field(default_factory=list)
+    aside: set[int] = field(default_factory=set)
 
     def add(self, batch: Batch) -> None:
         """Count `batch`."""
         self.inserts += 1
-        aside = poses_aside(batch)  # mounts, and the map's pose in the frame of GNSS
+        # Mounts, and the map's pose in the frame of GNSS, also where they came before the factor that tells.
+        found = set(poses_aside(batch).tolist()) - self.aside
+        self.aside |= found
         for group in batch.variables:
             if group.kind in ("se2", "se3"):
-                self.poses += int((~np.isin(group.keys, aside)).sum())
+                self.poses += int((~np.isin(group.keys, list(self.aside))).sum())
+                found.difference_update(group.keys.tolist())
             elif not group.kind.startswith("vector"):
                 self.landmarks += len(group.keys)
+        self.poses -= len(found)
         self.factors += batch.factor_count
 
     def measures(self) -> dict[str, Any]:

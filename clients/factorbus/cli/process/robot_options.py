@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.process.options import Number
+from factorbus.ros2.options import USUAL_IMU_NOISE
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -51,6 +52,15 @@ def robot_options(usual: bool) -> Callable[[F], F]:
             click.option(
                 "--fix-sigma", type=Number(min=0, min_open=True), default=5.0, show_default=True, metavar="METRES",
                 help="Of fixes whose covariance is of unknown type.",
+            ),
+            click.option(
+                "--imu", default="", metavar="TOPIC",
+                help="sensor_msgs/Imu, raw samples to read between poses in space (--space).  [default: none]",
+            ),
+            click.option(
+                "--imu-noise", nargs=4, type=Number(min=0, min_open=True), default=USUAL_IMU_NOISE, show_default=True,
+                metavar="GYRO ACC GYRO_WALK ACC_WALK",
+                help="Noise densities, rad/s/√Hz and m/s²/√Hz, and of the biases' walks, per √s.",
             ),
             click.option(
                 "--robot-id", type=int, metavar="N", help="Of this robot in pose graphs.  [default: of the first node]"
