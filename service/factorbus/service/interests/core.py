@@ -15,7 +15,7 @@ from typing import Any
 
 from factorbus.proto.interest import channel_of
 from factorbus.proto.messages import Delta, Variables
-from factorbus.proto.problems import Problem, TooLarge
+from factorbus.proto.problems import Busy, Problem, TooLarge
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Asker, Effect, Follow, Refuse
 from factorbus.service.interests.stream import InterestStream
@@ -76,9 +76,11 @@ class InterestCore:
             aside = list(self._aside)
             self._aside.clear()
             for delta in aside:
-                self._apply(delta)
-        if not self._tables.live:
-            return [self._fetch(fetched, now)]
+                if delta.epoch == epoch and self._tables.live:
+                    self._apply(delta)
+        if not self._tables.live:  # one is missing again; `tick` fetches
+            behind = Busy(len(self._aside), _FETCH_AGAIN_S, "deltas came before the estimate that they go on from")
+            return [] if fetched.asked is None else [Refuse(fetched.asker, behind)]
         return [] if fetched.asked is None else self._answer(fetched.asked, now)
 
     def delta(self, delta: Delta, now: float) -> list[Effect | FetchEstimate | EndChannel]:
