@@ -118,7 +118,9 @@ def _interests(estimate: Estimate) -> dict[str, bytes]:
     interest = checked_interest(Interest(("x", ""), ("se2",), (-1.0, -1.0, 10.0, 10.0), 1000, 4000))
     channel, epoch, revision = channel_of(interest), estimate.epoch, estimate.revision
     poses = filter_of(interest).pick(estimate.variables)
-    first, rest = (tuple(g._replace(keys=g.keys[cut], values=g.values[cut]) for g in poses) for cut in _CUTS)
+    first, rest = (
+        tuple(g._replace(keys=g.keys[cut], values=np.asarray(g.values)[cut]) for g in poses) for cut in _CUTS
+    )
     left = tuple(Variables(group.kind, group.keys) for group in first)
     named = InterestAnswer(epoch, revision, channel, 4711, 0, 30.0)
     return {

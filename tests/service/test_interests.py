@@ -62,8 +62,8 @@ def check(service: Service, follower: Follower) -> None:
         assert any(values.get(key) == value for values in world.history[: following.revision + 1])
 
 
-@settings(max_examples=60)
-@given(actions=st.lists(ACTIONS, max_size=30))
+@settings(max_examples=300)
+@given(actions=st.lists(ACTIONS, max_size=40))
 def test_a_mirror_has_the_part_of_the_estimate_at_its_revision_at_all_times(actions: list) -> None:
     world = World()
     service = Service(world)

@@ -17,6 +17,7 @@ from factorbus.proto.messages import Variables
 from factorbus.proto.problems import BadOption, UnknownKind
 from factorbus.proto.symbols import symbol_parts
 from factorbus.proto.variable_kinds import VARIABLE_KINDS
+from factorbus.wording import counted
 
 PERIOD_MS = (10, 60_000)
 BYTES_PER_S = (1000, 1 << 40)
@@ -124,7 +125,7 @@ def _box(given: Iterable[float], where: str) -> tuple[float, ...]:
     except (TypeError, ValueError, OverflowError):
         raise BadOption(where, f"is {given!r:.60}", "4 or 6 numbers") from None
     if len(box) not in (0, 4, 6):
-        raise BadOption(where, f"has {len(box)} numbers", "4 or 6: the lowest x y (z) and the highest x y (z)")
+        raise BadOption(where, f"has {counted(len(box), 'number')}", "4 or 6: the lowest x y (z) and the highest x y (z)")
     half = len(box) // 2
     for low, high in zip(box[:half], box[half:], strict=True):
         if not (math.isfinite(low) and math.isfinite(high) and -_FAR <= low <= high <= _FAR):

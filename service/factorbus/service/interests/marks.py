@@ -115,7 +115,9 @@ class InterestMarks:
                 self._leaving[kind] = np.union1d(self._leaving.get(kind, gone), gone)
             told = keys[(marks.sent[: len(keys)] > 0) & ~marks.held[: len(keys)] & ~stay]
             self._note_removed(number, kind, told)
-            self._kinds[kind] = marks.moved(origin)
+            self._kinds.pop(kind, None)
+            if len(origin):
+                self._kinds[kind] = marks.moved(origin)
 
     def forget(self) -> None:
         """Nobody has anything."""

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 _MOST_BYTES = 64 << 20
 
 
-class Place(Protocol):
+class Channels(Protocol):
     """Where a map publishes."""
 
     heard: Callable[[bytes], None] | None
@@ -56,7 +56,7 @@ class Interests:
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
 
-    def of_map(self, name: str, place: Place, read: Callable[[Read], None]) -> "MapInterests":
+    def of_map(self, name: str, place: Channels, read: Callable[[Read], None]) -> "MapInterests":
         """Those in map `name`.  read: asks its solver."""
         core = InterestCore(name, self._limits, lambda: secrets.randbits(62) | 1, self._check)
         return MapInterests(self, name, core, place, read)
@@ -140,7 +140,7 @@ class MapInterests:
     """Those in one map: what its host and its place call."""
 
     def __init__(
-        self, all_: Interests, name: str, core: InterestCore, place: Place, read: Callable[[Read], None]
+        self, all_: Interests, name: str, core: InterestCore, place: Channels, read: Callable[[Read], None]
     ) -> None:
         self.name, self.core, self.place = name, core, place
         self._all, self._read = all_, read
