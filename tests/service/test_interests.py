@@ -12,6 +12,7 @@ from factorbus.proto.interest import Interest, channel_of, filter_of
 from factorbus.proto.problems import Busy, TooLarge
 from factorbus.proto.symbols import symbol
 from factorbus.service.interests.stream import CARRIED_BYTES
+from factorbus.service.operations.metrics import of_interests
 
 FAST = Interest(period_ms=10)
 INTERESTS = (
@@ -294,3 +295,16 @@ def test_what_carries_a_message_is_counted() -> None:
     assert (row["channel"], row["messages"]) == (follower.following.channel, 1)
     assert 0 < answers - CARRIED_BYTES < 300
     assert math.isclose(row["period_ms"], 10)
+
+
+def test_metrics_count_interests_by_map() -> None:
+    world = World()
+    service = Service(world)
+    service.step(world.step(drive(world, 3)))
+    for letter in "ab":
+        following(service, Interest(letter))
+    rows = [{"map": "m", **row} for row in service.core.rows()]
+    samples = {family.name: family.samples for family in of_interests(rows)}
+    assert samples["map_interests"] == [(("m",), 2)]
+    assert samples["map_interest_bytes"] == [(("m",), sum(row["bytes"] for row in rows))]
+    assert samples["map_interest_waiting"] == [(("m",), 0)]

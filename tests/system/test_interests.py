@@ -1,6 +1,11 @@
 """Clients that follow a part of a map over the bus: a service in a process of its own, clients that come and die."""
 
+import json
+import os
+import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -187,6 +192,32 @@ def test_a_mirror_of_all_and_one_of_a_part_are_both_mirrors(bus: Bus) -> None:
         drive(part, 0, 3)
         part.estimate.wait_for(3)
         assert part.estimate["x2"].shape == (3,)
+
+
+def test_stats_and_top_say_what_each_channel_carries(bus: Bus, viewer: Bus, endpoint: str) -> None:
+    with (
+        bus.map("told") as whole,
+        viewer.map("told", interest=Interest("x", box=(0, 0, 9, 9), bytes_per_s=5000)) as part,
+    ):
+        part.estimate.wait_for(drive(whole, 0, 4))
+        said = command("stats", "told", endpoint)
+        assert re.search(r"interest in told.*x; box 0 0 9 9, every 100 ms, at most 5,000 bytes a second: ", said)
+        (row,) = json.loads(command("top", "--once", "--json", endpoint))["interests"]
+        assert (row["map"], row["letters"], row["waiting"]) == ("told", ["x"], 0)
+        assert row["bytes"] > 0
+        assert "box 0 0 9 9" in command("top", "--once", endpoint)
+
+
+def command(*words: str) -> str:
+    ran = subprocess.run(
+        [sys.executable, "-m", "factorbus.cli", *words[:-1], "--connect", words[-1]],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        env=os.environ | {"COLUMNS": "200"},
+    )
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
 
 
 HOSTILE = {

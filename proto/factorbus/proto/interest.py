@@ -125,7 +125,8 @@ def _box(given: Iterable[float], where: str) -> tuple[float, ...]:
     except (TypeError, ValueError, OverflowError):
         raise BadOption(where, f"is {given!r:.60}", "4 or 6 numbers") from None
     if len(box) not in (0, 4, 6):
-        raise BadOption(where, f"has {counted(len(box), 'number')}", "4 or 6: the lowest x y (z) and the highest x y (z)")
+        wanted = "4 or 6: the lowest x y (z) and the highest x y (z)"
+        raise BadOption(where, f"has {counted(len(box), 'number')}", wanted)
     half = len(box) // 2
     for low, high in zip(box[:half], box[half:], strict=True):
         if not (math.isfinite(low) and math.isfinite(high) and -_FAR <= low <= high <= _FAR):

@@ -95,10 +95,9 @@ def _map(row: Mapping[str, Any]) -> str:
 
 def interest_line(row: Mapping[str, Any]) -> str:
     """An interest, and what its channel has carried."""
-    return (
-        f"{part_of(row)}, every {row['period_ms']} ms{_bound(row)}: {counted(row['messages'], 'message')} and "
-        f"{counted(row['answers'], 'answer')}, {counted(row['bytes'], 'byte')}, {counted(row['waiting'], 'variable')} waiting"
-    )
+    carried = (counted(row[f"{name}s"], name) for name in ("message", "answer", "byte"))
+    told = f"{', '.join(carried)}, {counted(row['waiting'], 'variable')} waiting"
+    return f"{part_of(row)}, every {row['period_ms']} ms{_bound(row)}: {told}"
 
 
 def part_of(row: Mapping[str, Any]) -> str:

@@ -93,7 +93,7 @@ def families(health: Mapping[str, Any]) -> Iterator[Family]:
     yield _one("pieces", "counter", "Pieces of eliminations made on other cores than the map's own", cores["pieces"])
     yield from _of_workers(health.get("workers", ()))
     yield from _of_maps(health["maps"])
-    yield from _of_interests(health.get("interests", ()))
+    yield from of_interests(health.get("interests", ()))
     yield _one("maps_unopened", "gauge", "Maps on disk that do not open", len(health.get("unopened", ())))
     yield from _extra("disk", "", {"": health.get("disk", {})})
 
@@ -114,7 +114,8 @@ def _of_workers(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
     yield _by("worker_distrusted", "gauge", "1 while it gets no jobs because of that", "worker", distrusted)
 
 
-def _of_interests(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
+def of_interests(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
+    """Those of the interests, by map."""
     rows = list(rows)
     maps = sorted({row["map"] for row in rows})
     counts = {each: sum(row["map"] == each for row in rows) for each in maps}
