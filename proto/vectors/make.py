@@ -22,6 +22,16 @@ import numpy as np
 
 from factorbus.proto import codec
 from factorbus.proto.inertial import RESIDUAL, ImuForm
+from factorbus.proto.interest import Interest, channel_of, checked_interest, filter_of
+from factorbus.proto.interest_codec import (
+    AskInterest,
+    InterestAnswer,
+    InterestDelta,
+    encode_ask_interest,
+    encode_interest_answer,
+    encode_interest_delta,
+    filter_map,
+)
 from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind, inertial_kind, linear_kind
 from factorbus.proto.messages import (
     Batch,
@@ -44,8 +54,9 @@ _COLUMNS |= dict.fromkeys(("covariance", "distance", "threshold", "gain", "dista
 _COLUMNS |= dict.fromkeys(("plausible", "matched"), "u8")
 # Of changes and repairs, §17.
 _COLUMNS |= {"factors": "i64", "ids": "i64", "weight": "f64"}
-# Of variables, §4.
-_COLUMNS |= {"stamps": "i64"}
+# Of variables, §4, and interests, §18.
+_COLUMNS |= {"stamps": "i64", "box": "f64"}
+_CUTS = (slice(None, -1), slice(-1, None))
 
 
 def main() -> None:
@@ -59,8 +70,10 @@ def main() -> None:
 
 def vectors() -> dict[str, bytes]:
     """The golden messages by name."""
+    kitchen = _KITCHEN["messages"]()
     return {
-        **_KITCHEN["messages"](),
+        **kitchen,
+        **_interests(codec.decode_estimate(kitchen["estimate"])),
         **{
             f"kinds/{name}": codec.encode_insert(Insert(1, _one_of(kind), epoch=7))
             for name, kind in FACTOR_KINDS.items()
@@ -97,6 +110,34 @@ def vectors() -> dict[str, bytes]:
         "admin_create": codec.encode_map({"map": "kitchen", "mode": "auto"}),
         "admin_fork": codec.encode_map({"map": "kitchen", "as": "what-if", "request": 4711}),
         "event": codec.encode_map({"event": "created", "epoch": 7, "revision": 0}),
+    }
+
+
+def _interests(estimate: Estimate) -> dict[str, bytes]:
+    """A question for a part of the map whose estimate this is, the answers, and what its channel carries then."""
+    interest = checked_interest(Interest(("x", ""), ("se2",), (-1.0, -1.0, 10.0, 10.0), 1000, 4000))
+    channel, epoch, revision = channel_of(interest), estimate.epoch, estimate.revision
+    poses = filter_of(interest).pick(estimate.variables)
+    first, rest = (
+        tuple(g._replace(keys=g.keys[cut], values=np.asarray(g.values)[cut]) for g in poses) for cut in _CUTS
+    )
+    left = tuple(Variables(group.kind, group.keys) for group in first)
+    named = InterestAnswer(epoch, revision, channel, 4711, 0, 30.0)
+    return {
+        "ask_interest": encode_ask_interest(AskInterest(checked_interest(Interest()))),
+        "ask_interest_following": encode_ask_interest(AskInterest(interest, True, 4711, 12)),
+        "interest_answer": encode_interest_answer(named),
+        "interest_answer_whole": encode_interest_answer(
+            named._replace(whole=True, variables=first, waiting=1, converged=True, converging=False)
+        ),
+        "interest_answer_missed": encode_interest_answer(named._replace(number=14, variables=rest, gone=left)),
+        "interest_delta": encode_interest_delta(
+            InterestDelta(epoch, revision, revision - 1, 4711, 13, rest, converged=True, converging=False)
+        ),
+        "interest_delta_gone": encode_interest_delta(
+            InterestDelta(epoch, revision, revision, 4711, 14, gone=left, waiting=3)
+        ),
+        "ask_part": codec.encode_map(filter_map(interest)),
     }
 
 

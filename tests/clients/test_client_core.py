@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorbus.client.draft import Draft
-from factorbus.client.following import Following, tables_of
+from factorbus.client.following import Following
+from factorbus.client.held_values import HeldValues
 from factorbus.client.replies import Again, AnswerReply, Failure, Silence, TimedOut, interpret_reply
-from factorbus.client.table import Table
 from factorbus.client.window import Window
 from factorbus.proto.codec import encode_problem
 from factorbus.proto.messages import Delta, Estimate, Variables
@@ -29,6 +29,7 @@ from factorbus.proto.problems import (
 )
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
+from factorbus.proto.table import Table
 
 
 def test_an_answer_is_handed_on() -> None:
@@ -142,7 +143,7 @@ def column(keys: list[int], at: float) -> tuple[Variables, ...]:
 
 
 def follow(following: Following, estimate: Estimate) -> list[Delta]:
-    return following.estimate(estimate, tables_of(estimate))
+    return following.estimate(estimate, HeldValues(estimate.variables))
 
 
 def started(revision: int = 3) -> Following:
@@ -155,8 +156,8 @@ def test_deltas_in_order_are_applied() -> None:
     following = started()
     delta = Delta(7, 4, 3, column([2, 3], 4.0))
     assert following.delta(delta) == [delta]
-    assert (following.live, following.revision, following.count()) == (True, 4, 3)
-    keys, values = following.columns()["point2"]
+    assert (following.live, following.revision, following.values.count()) == (True, 4, 3)
+    keys, values = following.values.columns()["point2"]
     assert keys.tolist() == [1, 2, 3]
     assert values.tolist() == [[0, 1], [4, 2], [4, 3]]
 
@@ -166,11 +167,11 @@ def test_a_gap_is_noticed_and_mended_by_the_estimate_and_what_came_meanwhile() -
     assert following.delta(Delta(7, 5, 4, column([1], 5.0))) == []
     assert not following.live
     assert following.delta(Delta(7, 6, 5, column([3], 6.0))) == []
-    assert following.value(1).tolist() == [0, 1]  # the old value stays readable
+    assert following.values.value(1).tolist() == [0, 1]  # the old value stays readable
     news = follow(following, Estimate(7, 5, column([1, 2], 5.0)))
     assert [(delta.previous, delta.revision) for delta in news] == [(0, 5), (5, 6)]
     assert (following.live, following.revision) == (True, 6)
-    assert following.value(3).tolist() == [6, 3]
+    assert following.values.value(3).tolist() == [6, 3]
 
 
 def test_an_estimate_older_than_the_gap_is_not_enough() -> None:
@@ -190,7 +191,7 @@ def test_what_is_older_than_we_are_changes_nothing() -> None:
     following.lost()
     assert follow(following, Estimate(7, 5, column([1], 9.0))) == []
     assert not following.live
-    assert following.value(1).tolist() == [0, 1]
+    assert following.values.value(1).tolist() == [0, 1]
 
 
 def test_another_epoch_starts_over() -> None:
@@ -198,7 +199,7 @@ def test_another_epoch_starts_over() -> None:
     assert following.delta(Delta(8, 1, 0, column([1], 1.0))) == []
     assert not following.live
     follow(following, Estimate(8, 1, column([1], 1.0)))
-    assert (following.live, following.epoch, following.revision, following.count()) == (True, 8, 1, 1)
+    assert (following.live, following.epoch, following.revision, following.values.count()) == (True, 8, 1, 1)
 
 
 @given(
@@ -221,7 +222,7 @@ def test_whatever_is_lost_a_live_mirror_is_bitwise_the_map(losses: list[bool], a
         if not following.live:  # the answer may be some steps old
             follow(following, history[max(0, revision - answers[revision - 1])])
         if following.live and following.revision == revision:
-            keys_now, values = following.columns()["point2"]
+            keys_now, values = following.values.columns()["point2"]
             assert dict(zip(keys_now.tolist(), values[:, 0].tolist(), strict=True)) == truth
 
 

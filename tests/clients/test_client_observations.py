@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from factorbus.client import Draft
-from factorbus.client.following import Following, tables_of
+from factorbus.client.following import Following
+from factorbus.client.held_values import HeldValues
 from factorbus.proto import codec
 from factorbus.proto.camera import Camera
 from factorbus.proto.messages import Delta, Estimate, Insert, Variables
@@ -53,12 +54,12 @@ def test_a_delta_of_everything_lets_go_of_what_there_was() -> None:
     point = Variables("point3", np.array([KEY]), np.array([[1.0, 2, 3]]))
     following = Following()
     start = Estimate(7, 3, (feature,))
-    following.estimate(start, tables_of(start))
+    following.estimate(start, HeldValues(start.variables))
     whole = Delta(7, 4, 0, (point,))
     assert following.delta(whole) == [whole]
-    assert (following.live, following.revision, following.count()) == (True, 4, 1)
-    assert following.columns_of("idp") is None
-    np.testing.assert_array_equal(following.value(KEY), [1, 2, 3])
+    assert (following.live, following.revision, following.values.count()) == (True, 4, 1)
+    assert following.values.columns_of("idp") is None
+    np.testing.assert_array_equal(following.values.value(KEY), [1, 2, 3])
     assert following.delta(whole) == [], "it has been seen"
     after = Delta(7, 5, 4, (point,))
     assert following.delta(after) == [after]

@@ -1,5 +1,6 @@
 """`factorbus watch`: the recording holds what the map had, and the served page shows it in a real browser."""
 
+import re
 import signal
 import socket
 import time
@@ -36,6 +37,43 @@ def rows(path: Path) -> dict[str, dict[int, dict[str, Any]]]:
         for row in chunk.to_record_batch().to_pylist():
             found[chunk.entity_path][row["revision"]] |= {k: v for k, v in row.items() if v is not None}
     return found
+
+
+def test_a_part_of_a_map_is_watched_without_the_rest(
+    endpoint: str, spawn: Callable[..., Process], tmp_path: Path
+) -> None:
+    path, box = tmp_path / "part.rrd", "--box=-4,-4,4,4"
+    with connect(endpoint, client="robot") as bus, bus.map("partly") as joined:
+        for step in city_trees(poses=60, seed=2):
+            joined.insert(step.batch)
+        joined.wait_converged(60)
+        watch = ("-m", "factorbus.cli", "watch", "partly", "--connect", endpoint, "--save", str(path))
+        watcher = spawn(*watch, "--only", "x", box, "--period-ms", "20", "--bytes-per-s", "100000")
+        watcher.ready()
+        (interest,) = joined.stats()["interests"]
+        assert (interest["letters"], interest["box"]) == (["x"], [-4.0, -4.0, 4.0, 4.0])
+        poses = joined.estimate.columns("se2")[1]
+        near = poses[(np.abs(poses[:, :2]) <= 4.0).all(axis=1)]
+        watcher.signal(signal.SIGINT)
+        assert watcher.wait() == OK
+    assert re.search(r"its part came in [\d,]+ bytes", watcher.errors())
+    found = rows(path)
+    strips = [strip for row in found["/map/trajectory/x"].values() for strip in row["LineStrips3D:strips"]]
+    assert 0 < len(near) < len(poses)
+    assert sum(map(len, strips)) <= len(near)
+    assert "/map/landmarks" not in found
+
+
+def test_a_part_that_is_none_is_refused_before_anything_is_asked(spawn: Callable[..., Process]) -> None:
+    for wrong, said in (
+        ("--box=1,2,3", "4 or 6"),
+        ("--box=a,b", "4 or 6"),
+        ("--kind=se9", "se9"),
+        ("--only=1", "letter"),
+    ):
+        watcher = spawn("-m", "factorbus.cli", "watch", "m", "--connect", "tcp/127.0.0.1:1", "--save", "x.rrd", wrong)
+        assert watcher.wait() != OK
+        assert said in watcher.errors(), wrong
 
 
 def test_the_recording_has_every_step_and_the_map_at_the_end(

@@ -14,7 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from factorbus.proto import codec
+from factorbus.proto import codec, interest_codec
 from factorbus.proto.kinds import CHANGES, FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind
 from factorbus.proto.messages import (
     Accepted,
@@ -50,6 +50,9 @@ ENCODERS: dict[str, Callable[[Any], bytes]] = {
     "optimum": codec.encode_optimum,
     "problem": codec.encode_problem,
     "ask_estimate": codec.encode_keys_asked,
+    "ask_interest": interest_codec.encode_ask_interest,
+    "interest_answer": interest_codec.encode_interest_answer,
+    "interest_delta": interest_codec.encode_interest_delta,
 }
 DECODERS: dict[str, Callable[[bytes], Any]] = {
     "insert": codec.decode_insert,
@@ -63,6 +66,9 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "optimum": codec.decode_optimum,
     "problem": codec.decode_problem,
     "ask_estimate": codec.decode_keys_asked,
+    "ask_interest": interest_codec.decode_ask_interest,
+    "interest_answer": interest_codec.decode_interest_answer,
+    "interest_delta": interest_codec.decode_interest_delta,
     "map": codec.decode_map,
 }
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from factorbus.client import link
-from factorbus.proto import keys, messages, problems
+from factorbus.proto import interest, interest_codec, keys, messages, problems
 from factorbus.proto.expressions.operations import OPERATIONS
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.protocol import known
@@ -70,10 +70,14 @@ def test_every_code_is_explained() -> None:
         messages.Variables,
         messages.Factors,
         messages.Change,
+        interest_codec.AskInterest,
+        interest_codec.InterestAnswer,
+        interest_codec.InterestDelta,
+        interest.Interest,
     ],
 )
 def test_every_field_is_explained(message: Any) -> None:
-    names = set(message.__match_args__) - {"batch"}
+    names = set(message.__match_args__) - {"batch", "interest"}
     assert not {name for name in names if f"`{name}`" not in CONTRACT}
 
 
@@ -85,6 +89,7 @@ def test_every_field_is_explained(message: Any) -> None:
         (keys.delta_key("m"), "map/<map>/out/delta"),
         (keys.snapshot_key("m"), "map/<map>/out/snapshot"),
         (keys.event_key("m"), "map/<map>/out/event"),
+        (keys.channel_key("m", "interest-0123456789abcdef"), "map/<map>/out/interest-<id>"),
         (keys.service_token("m", "s"), "map/<map>/live/service/<id>"),
         (keys.client_token("m", "c"), "map/<map>/live/client/<client>"),
         (keys.admin_key("maps"), "admin/maps"),

@@ -15,7 +15,8 @@ from factorbus.client.features import Features, Growing
 from factorbus.client.filter_state import Factored, FilterState
 from factorbus.client.imu import ImuNoise, Standstill, cut_samples, initial_from_standstill
 from factorbus.client.imu_samples import ImplausibleSamples
-from factorbus.client.map import Map, MapRow
+from factorbus.client.map import Map
+from factorbus.client.map_row import MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
@@ -23,6 +24,7 @@ from factorbus.client.preintegration import PreintegratedImu, preintegrate_sampl
 from factorbus.client.renaming_kinds import rename_kinds
 from factorbus.client.snapshot import Snapshot
 from factorbus.proto.camera import BadCamera, Camera
+from factorbus.proto.interest import Interest
 from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
 
 __all__ = [
@@ -41,6 +43,7 @@ __all__ = [
     "Growing",
     "ImplausibleSamples",
     "ImuNoise",
+    "Interest",
     "KeyCollision",
     "Map",
     "MapRow",

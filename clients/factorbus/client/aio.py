@@ -28,7 +28,7 @@ from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.filter_state import Factored, FilterState
 from factorbus.client.key_numbers import Key
 from factorbus.client.map import Map as SyncMap
-from factorbus.client.map import MapRow
+from factorbus.client.map_row import MapRow
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
@@ -37,6 +37,7 @@ from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.asking import Repaired
 from factorbus.proto.camera import Camera
+from factorbus.proto.interest import Interest
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, MapGraph
 
 
@@ -67,10 +68,19 @@ class Bus:
 
     @asynccontextmanager
     async def map(
-        self, name: str, mode: str = "auto", *, window: int = 32, mirror: bool = True, create: bool = True
+        self,
+        name: str,
+        mode: str = "auto",
+        *,
+        window: int = 32,
+        mirror: bool = True,
+        create: bool = True,
+        interest: Interest | None = None,
     ) -> AsyncIterator[Map]:
         """As `factorbus.client.Bus.map`, in `async with`; leaving it waits for what was sent."""
-        joined = await asyncio.to_thread(self._bus.map, name, mode, window=window, mirror=mirror, create=create)
+        joined = await asyncio.to_thread(
+            self._bus.map, name, mode, window=window, mirror=mirror, create=create, interest=interest
+        )
         try:
             here = Map(joined, window)
             yield here

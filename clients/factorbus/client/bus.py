@@ -9,13 +9,15 @@ from typing import Any
 from factorbus.client.arguments import checked_flag, checked_seconds, of_type
 from factorbus.client.features import Features
 from factorbus.client.link import Link, open_link
-from factorbus.client.map import SUFFIX_LENGTH, Map, MapRow
+from factorbus.client.map import SUFFIX_LENGTH, Map
+from factorbus.client.map_row import MapRow
 from factorbus.client.permission import inserts_pass
 from factorbus.client.query_all import query_all
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, fields, keys
 from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
+from factorbus.proto.interest import Interest, checked_interest
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadOption, Problem, Refused, UnknownMap
 
@@ -73,18 +75,23 @@ class Bus:
         mirror: bool = True,
         create: bool = True,
         client: str = "",
+        interest: Interest | None = None,
     ) -> Map:
         """Join map `name`, creating it if there is none (with create=False: UnknownMap).
 
         window: inserts that may be unanswered at a time.  mirror: keep a live copy of the estimate; returns once
         it is there.  client: who inserts into this map, where one connection is used for several; empty: that of
-        `connect`.  Raises Refused, Unavailable, BadName, UnknownMap.
+        `connect`.  interest: mirror these variables alone, so fast; `insert` does not wait until the mirror has them.
+        Raises Refused, Unavailable, BadName, BadOption, UnknownKind, UnknownMap, NotSupported.
         """
         keys.checked_name("map", name)
         client = keys.checked_name("client", client or self.client, keys.LONGEST_NAME - SUFFIX_LENGTH)
         mirror, create = checked_flag("mirror", mirror), checked_flag("create", create)
         if of_type("window", window, Integral, "a whole number, 1 or more") < 1:
             raise BadOption("window", str(window), "a whole number, 1 or more")
+        part = None if interest is None else checked_interest(of_type("interest", interest, Interest, "an Interest"))
+        if part is not None and not mirror:
+            raise BadOption("interest", "given with mirror=False", "a mirror, which the interest is about")
         joined = Map(
             self._link,
             self._sender,
@@ -97,7 +104,7 @@ class Bus:
         try:
             joined.watch_owner()
             if mirror:
-                joined.open_mirror()
+                joined.open_mirror(part)
         except BaseException:
             joined.close()
             raise

@@ -10,14 +10,11 @@ whose delta is not here is not yet a loss: the estimate is asked for too, and wh
 """
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
-from factorbus.client.table import Table
-from factorbus.proto.arrays import F64, I64
-from factorbus.proto.messages import Delta, Estimate, Variables
+from factorbus.client.held_values import HeldValues
+from factorbus.proto.messages import Delta, Estimate
 
 # While lost this many deltas wait; if more come before the estimate does, the oldest go: the estimate is newer.
 _KEPT_ASIDE = 256
@@ -33,7 +30,7 @@ class Following:
         # At this revision; None: nobody has said.
         self.converged: bool | None = None
         self.converging: bool | None = None
-        self._tables: dict[str, Table] = {}
+        self.values = HeldValues()
         self._aside: deque[Delta] = deque(maxlen=_KEPT_ASIDE)
 
     def delta(self, delta: Delta) -> list[Delta]:
@@ -42,7 +39,7 @@ class Following:
             return []
         if self.live and delta.epoch == self.epoch and delta.previous == 0 and self.revision:
             # The whole estimate: features have become points, so what was under their keys is no more.
-            self._tables = tables_of(Estimate(delta.epoch, delta.revision, delta.variables))
+            self.values = HeldValues(delta.variables)
             self._be_at(delta)
             return [delta]
         if self.live and delta.epoch == self.epoch and delta.previous == self.revision:
@@ -52,8 +49,8 @@ class Following:
         self._aside.append(delta)
         return []
 
-    def estimate(self, estimate: Estimate, tables: dict[str, Table]) -> list[Delta]:
-        """The whole estimate came, `tables` being `tables_of` it.  Returns what is new to the readers.
+    def estimate(self, estimate: Estimate, values: HeldValues) -> list[Delta]:
+        """The whole estimate came, with its values.  Returns what is new to the readers.
 
         The first item stands for the estimate itself: a delta from revision 0.
         """
@@ -64,7 +61,7 @@ class Following:
         news = [Delta(estimate.epoch, estimate.revision, 0, estimate.variables)]
         if (estimate.epoch, estimate.revision) != (self.epoch, self.revision):
             self.converged = self.converging = None
-        self.epoch, self.revision, self._tables, self.live = estimate.epoch, estimate.revision, tables, True
+        self.epoch, self.revision, self.values, self.live = estimate.epoch, estimate.revision, values, True
         for delta in aside:
             if delta.epoch == self.epoch:
                 news += self.delta(delta)
@@ -74,36 +71,8 @@ class Following:
         """Nobody owns the map at the moment, or nobody answers: what we hold may be old."""
         self.live = False
 
-    def value(self, key: int) -> F64 | None:
-        """A copy of one variable's value."""
-        for table in self._tables.values():
-            if (value := table.get(key)) is not None:
-                return value
-        return None
-
-    def stamp(self, key: int) -> int | None:
-        """The time stamp of one variable, if it has one."""
-        return next((stamp for table in self._tables.values() if (stamp := table.stamp(key)) is not None), None)
-
-    def stamps(self) -> dict[str, I64]:
-        """Copies of the time stamps by kind, in the order of `columns`."""
-        return {kind: table.stamps() for kind, table in self._tables.items()}
-
-    def columns(self) -> dict[str, tuple[I64, F64]]:
-        """Copies of (keys, values) by kind, ordered by key."""
-        return {kind: table.columns() for kind, table in self._tables.items()}
-
-    def columns_of(self, kind: str) -> tuple[I64, F64] | None:
-        """Copies of (keys, values) of one kind, ordered by key."""
-        table = self._tables.get(kind)
-        return None if table is None else table.columns()
-
-    def count(self) -> int:
-        """Number of variables."""
-        return sum(table.count for table in self._tables.values())
-
     def _apply(self, delta: Delta) -> None:
-        _put(self._tables, delta.variables)
+        self.values.put(delta.variables)
         self._be_at(delta)
 
     def _be_at(self, delta: Delta) -> None:
@@ -115,21 +84,3 @@ class Following:
         converged, converging = told.get("converged"), told.get("converging")
         self.converged = converged if isinstance(converged, bool) else None
         self.converging = converging if isinstance(converging, bool) else None
-
-
-def tables_of(estimate: Estimate) -> dict[str, Table]:
-    """The tables that hold `estimate`: built apart from those being read."""
-    tables: dict[str, Table] = {}
-    _put(tables, estimate.variables)
-    return tables
-
-
-def _put(tables: dict[str, Table], groups: Iterable[Variables]) -> None:
-    for group in groups:
-        values = group.values
-        if values is None or not len(group.keys):
-            continue
-        table = tables.get(group.kind)
-        if table is None:
-            table = tables[group.kind] = Table(values.shape[1])
-        table.put(np.asarray(group.keys), values, group.stamps)

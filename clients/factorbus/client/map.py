@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any
 
@@ -16,52 +15,28 @@ from numpy.typing import ArrayLike
 from factorbus.client.arguments import checked_flag, checked_seconds, of_type
 from factorbus.client.changes import Changes, some_of
 from factorbus.client.draft import Draft, batch_of
+from factorbus.client.interest_mirror import InterestMirror
 from factorbus.client.key_numbers import Key
 from factorbus.client.link import Link
+from factorbus.client.map_row import MapRow
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import PendingInsert
 from factorbus.client.questions import Questions, logged
 from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.request_sender import Request, RequestSender
-from factorbus.client.supported import check_changes, check_stamps
+from factorbus.client.supported import check_changes, check_interest, check_stamps
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
+from factorbus.proto.interest import Interest
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Insert, MapGraph
 from factorbus.proto.problems import ClosedHere, NoMirror, Problem, Refused, TooLarge, Unavailable
 from factorbus.wording import counted
 
 SUFFIX_LENGTH = 9  # characters that joining a map adds to the name of a client
-
-
-@dataclass(frozen=True, slots=True)
-class MapRow:
-    """A map as the service lists it.
-
-    state: "open"; "blocked" while its journal cannot be written; anything else: it is on disk and does not open
-    (`damaged`, `differs`, `other_version`, `unreadable`), and `problem` says why.  Of such a map there are no numbers.
-    protocol: the names that its service knows (`changes`, `factors`, ...), as §13 of the contract has them; empty in a
-    list of maps.  converged: its last step had; None: the service does not say.  converging: it takes further steps by
-    itself, unless an insert comes.  reproducible: as far as is known, its journal gives the same estimate again to the
-    bit; if not, `reason` says why; None: it has no journal, or the service does not say.
-    """
-
-    name: str
-    mode: str
-    epoch: int
-    revision: int
-    variables: int
-    factors: int
-    state: str = "open"
-    problem: str = ""
-    protocol: Mapping[str, Any] = field(default_factory=dict)
-    converged: bool | None = None
-    converging: bool = False
-    reproducible: bool | None = None
-    reason: str = ""
 
 
 class Map:
@@ -253,9 +228,20 @@ class Map:
             self._enter(self._join())
         return self.epoch
 
-    def ask_estimate(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Estimate:
-        """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
-        return self.ask.estimate(of, timeout_s).result()
+    def ask_estimate(
+        self,
+        of: Sequence[Key] | Key | None = None,
+        timeout_s: float | None = None,
+        *,
+        interest: Interest | None = None,
+    ) -> Estimate:
+        """Values from the service at one revision: all, of some variables, or of those in `interest`.
+
+        Raises Refused, Unavailable, BadOption, UnknownKind, NotSupported.
+        """
+        if interest is not None:
+            check_interest(self._protocol)
+        return self.ask.estimate(of, timeout_s, interest).result()
 
     def chi2(self, batch: bool = False, timeout_s: float | None = None, *, values: bool = False) -> Chi2:
         """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch, with `values` that itself.
@@ -320,10 +306,14 @@ class Map:
             self._presence.close()
             self._stack.close()
 
-    def open_mirror(self) -> None:
-        """Start the live estimate and wait for it.  Raises Unavailable."""
-        mirror = Mirror(self._link, self.name, self.timeout_s)
-        self._mirror = mirror
+    def open_mirror(self, interest: Interest | None = None) -> None:
+        """Start the live estimate, or that of a part, and wait for it.  Raises Unavailable, NotSupported, Refused."""
+        if interest is not None:
+            check_interest(self._protocol)
+            self._mirror = InterestMirror(self._link, self.name, self.timeout_s, interest)
+            self._mirror.start(self._stack)
+            return
+        self._mirror = mirror = Mirror(self._link, self.name, self.timeout_s)
         row = self._row
         if row.converged or row.converging:  # neither: the map gave up, and the row does not say why
             mirror.expect_convergence(row.epoch, row.revision, bool(row.converged), row.converging)

@@ -9,8 +9,10 @@ from contextlib import ExitStack
 from numbers import Integral
 from typing import Any
 
-from factorbus.client.arguments import checked_seconds, of_type, seen
-from factorbus.client.following import Following, tables_of
+from factorbus.client.arguments import checked_seconds, of_type
+from factorbus.client.delta_callbacks import DeltaCallbacks
+from factorbus.client.following import Following
+from factorbus.client.held_values import HeldValues
 from factorbus.client.key_numbers import key_number
 from factorbus.client.link import Link
 from factorbus.client.replies import AnswerReply, Reply, TimedOut, pause
@@ -21,7 +23,7 @@ from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_ask
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Delta
-from factorbus.proto.problems import BadOption, BadSymbol, ClosedHere, NotConverged, NotHeld, NotReached, Unavailable
+from factorbus.proto.problems import BadSymbol, ClosedHere, NotConverged, NotHeld, NotReached, Unavailable
 from factorbus.proto.symbols import format_symbol
 
 log = logging.getLogger("factorbus.client")
@@ -47,10 +49,10 @@ class Mirror:
 
     def __init__(self, link: Link, map_name: str, timeout_s: float) -> None:
         self._link, self._map, self._timeout_s = link, map_name, timeout_s
-        self._following = Following()
+        self._following: Any = Following()  # or that of a part
         self._lock = threading.RLock()  # entered itself, and not by its condition: see `interruptible_future.py`
         self._changed = threading.Condition(self._lock)
-        self._callbacks: list[Callable[[Delta], None]] = []
+        self._callbacks = DeltaCallbacks(map_name)
         self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._owners: set[str] = set()
         self._deserted = False  # the map had an owner, and has none now
@@ -60,7 +62,7 @@ class Mirror:
         self._ask_at = 0.0
         self._gave_up = ""  # why the map does not go on converging
         self._foretold: tuple[int, int, dict[str, Any]] = (0, 0, {})  # epoch, revision, and how far it had converged
-        self._closing = False
+        self._closing, self._received = False, 0
         self._thread = threading.Thread(target=self._run, name=f"factorbus-mirror-{map_name}", daemon=True)
 
     def __getitem__(self, key: str | int) -> F64:
@@ -70,7 +72,7 @@ class Mirror:
         except BadSymbol as bad:
             raise NotHeld(bad.message) from None
         with self._lock:
-            value = self._following.value(number)
+            value = self._following.values.value(number)
         if value is None:
             raise NotHeld(f"{format_symbol(number)} is not in map {self._map!r} at revision {self.revision}")
         return value
@@ -84,7 +86,7 @@ class Mirror:
 
     def __len__(self) -> int:
         with self._lock:
-            return self._following.count()
+            return self._following.values.count()
 
     @property
     def revision(self) -> int:
@@ -116,16 +118,26 @@ class Mirror:
         """Seconds since the service last confirmed these values: by a delta, or by answering that nothing changed."""
         return time.monotonic() - self._confirmed_at
 
+    @property
+    def waiting(self) -> int:
+        """Variables that the service has yet to send; 0 but for an interest with a bound."""
+        return 0
+
+    @property
+    def received_bytes(self) -> int:
+        """Bytes of the messages and answers that have come to keep these values."""
+        return self._received
+
     def stamp(self, key: str | int) -> int | None:
         """When a variable was, "x12" or its number: the nanoseconds that it came with, or None.  Raises NotHeld."""
         with self._lock:
             self[key]
-            return self._following.stamp(key_number(key))
+            return self._following.values.stamp(key_number(key))
 
     def columns(self, kind: str) -> tuple[I64, F64]:
         """(keys (n,), values (n, size)) of all variables of `kind`, ordered by key: copies.  Raises NotHeld."""
         with self._lock:
-            columns = self._following.columns_of(kind)
+            columns = self._following.values.columns_of(kind)
         if columns is None:
             raise NotHeld(f"no variables of kind {kind!r} in map {self._map!r} at revision {self.revision}")
         return columns
@@ -133,7 +145,9 @@ class Mirror:
     def snapshot(self) -> Snapshot:
         """Everything, at one revision."""
         with self._lock:
-            return Snapshot(self.epoch, self.revision, self._following.columns(), self._following.stamps())
+            return Snapshot(
+                self.epoch, self.revision, self._following.values.columns(), self._following.values.stamps()
+            )
 
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the values are of `revision` or later and not stale.
@@ -174,11 +188,7 @@ class Mirror:
         It runs on the mirror's thread: while it runs nothing new is applied.  After a resynchronization it gets
         one delta with `previous` 0 that holds the whole estimate.  A callback that raises is logged.  Raises BadOption.
         """
-        if not callable(callback):
-            raise BadOption("callback", seen(callback), "a function of a delta")
-        with self._lock:
-            self._callbacks = [*self._callbacks, callback]
-        return lambda: self._forget(callback)
+        return self._callbacks.add(callback)
 
     def start(self, stack: ExitStack) -> None:
         """Subscribe, then ask; `stack` gets what ends it.  Returns when the estimate is here.  Raises Unavailable."""
@@ -206,6 +216,7 @@ class Mirror:
     # From here on: callbacks of the bus, which only hand over, and the mirror's own thread.
 
     def _hear(self, word: str, data: bytes) -> None:
+        self._received += len(data)
         if self._inbox.qsize() < _BACKLOG:
             self._inbox.put((word, data))
         # Otherwise it is lost, and the next one that fits shows the gap.
@@ -232,10 +243,6 @@ class Mirror:
     def _check_open(self) -> None:
         if self._closing:
             raise ClosedHere(f"map {self._map!r}", connection=self._link.closed)
-
-    def _forget(self, callback: Callable[[Delta], None]) -> None:
-        with self._lock:
-            self._callbacks = [each for each in self._callbacks if each is not callback]
 
     def _stop(self) -> None:
         self._inbox.put(("stop", None))
@@ -267,7 +274,7 @@ class Mirror:
     def _handle(self, word: str, content: Any) -> None:
         match word:
             case "delta":
-                self._apply_delta(decode_delta(content))
+                self._apply_delta(content)
             case "snapshot":
                 self._adopt(content)
             case "estimate":
@@ -283,27 +290,28 @@ class Mirror:
                     self._closing = True
                     self._changed.notify_all()
 
-    def _apply_delta(self, delta: Delta) -> None:
+    def _apply_delta(self, content: bytes) -> None:
+        delta = decode_delta(content)
         with self._lock:
             news, self._gave_up = self._following.delta(delta), ""
             self._confirm()
-        self._tell(news)
+        self._callbacks.tell(news)
 
     def _adopt(self, data: bytes) -> None:
         estimate = decode_estimate(data)
         if (estimate.epoch, estimate.revision) == (self.epoch, self.revision) and self._following.live:
             return
-        tables = tables_of(estimate)  # outside the lock: readers do not wait for it
+        values = HeldValues(estimate.variables)  # outside the lock: readers do not wait for it
         with self._lock:
             if estimate.epoch != self._following.epoch:
                 self._expected = 0
-            news = self._following.estimate(estimate, tables)
+            news = self._following.estimate(estimate, values)
             if self._foretold[:2] == (self.epoch, self.revision) and self.converged is None:
                 self._following.take_convergence(self._foretold[2])
             if self._following.live and self.converged is None:
                 self._probe()
             self._confirm()
-        self._tell(news)
+        self._callbacks.tell(news)
 
     def _take_estimate(self, reply: Reply) -> None:
         self._asking = False
@@ -375,14 +383,6 @@ class Mirror:
             self._confirmed_at = time.monotonic()
             self._changed.notify_all()
 
-    def _tell(self, news: list[Delta]) -> None:
-        for delta in news:
-            for callback in self._callbacks:
-                try:
-                    callback(delta)
-                except Exception:
-                    log.exception("map %s: on_delta callback failed at revision %d", self._map, delta.revision)
-
     def _ask(self) -> None:
         if not self._asking and time.monotonic() >= self._ask_at and not self._closing:
             self._asking = True
@@ -390,4 +390,9 @@ class Mirror:
 
     def _query(self, question: str, payload: bytes, word: str) -> None:
         key = keys.ask_key(self._map, question)
-        self._link.ask(key, payload, _ANSWER_S, lambda reply: self._inbox.put((word, reply)))
+
+        def hear(reply: Reply) -> None:
+            self._received += len(getattr(reply, "payload", b""))
+            self._inbox.put((word, reply))
+
+        self._link.ask(key, payload, _ANSWER_S, hear)

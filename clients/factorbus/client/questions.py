@@ -5,11 +5,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple, TypeVar
 
-from factorbus.client.arguments import checked_flag, checked_probability, checked_seconds
+from factorbus.client.arguments import checked_flag, checked_probability, checked_seconds, of_type
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import AskRepair, Repaired
+from factorbus.proto.interest import Interest, checked_interest
+from factorbus.proto.interest_codec import filter_map
 from factorbus.proto.messages import Chi2, Estimate, MapGraph
 from factorbus.proto.problems import BadMessage
 from factorbus.proto.repair_codec import decode_repaired, encode_ask_repair
@@ -31,10 +33,15 @@ class Questions:
     def __init__(self, sender: RequestSender, map_name: str, timeout_s: float) -> None:
         self._sender, self._map, self._timeout_s = sender, map_name, timeout_s
 
-    def estimate(self, of: Sequence[Key] | Key | None, timeout_s: float | None) -> Future[Estimate]:
+    def estimate(
+        self, of: Sequence[Key] | Key | None, timeout_s: float | None, interest: Interest | None = None
+    ) -> Future[Estimate]:
         """Values at one revision: all, or of some variables."""
-        numbers = None if of is None else key_numbers(of)
-        return self._ask("estimate", codec.encode_keys_asked(numbers), codec.decode_estimate, timeout_s)
+        payload = codec.encode_keys_asked(None if of is None else key_numbers(of))
+        if interest is not None:
+            part = checked_interest(of_type("interest", interest, Interest, "an Interest"))
+            payload = codec.encode_map(codec.decode_map(payload) | filter_map(part))
+        return self._ask("estimate", payload, codec.decode_estimate, timeout_s)
 
     def chi2(self, batch: bool, timeout_s: float | None, values: bool = False) -> Future[Chi2]:
         """Σ rᵀΩr; with `batch` also of the optimum from scratch, for which a worker gets `timeout_s`; or all of it."""

@@ -43,7 +43,9 @@ class DeltaStream:
                 if not self._waiting:
                     return None
                 delta = self._waiting.popleft()
-            if delta.epoch != self._at[0] or delta.revision > self._at[1]:
+            # Of one revision there are several where the rest of a part of the map follows.
+            more = delta.previous == delta.revision
+            if delta.epoch != self._at[0] or delta.revision > self._at[1] or more:
                 return delta
 
     def close(self) -> None:

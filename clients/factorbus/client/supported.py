@@ -22,3 +22,9 @@ def check_stamps(protocol: Mapping[str, Any], batch: Batch) -> None:
     skipped = bool(protocol) and "stamps" not in protocol.get("variable_fields", ())
     if skipped and any(group.stamps is not None for group in batch.variables):
         raise NotSupported("time stamps of variables", str(protocol.get("product", "")))
+
+
+def check_interest(protocol: Mapping[str, Any]) -> None:
+    """Raises NotSupported where a service with this protocol knows of no interests."""
+    if protocol and "interest" not in protocol.get("questions", ()):
+        raise NotSupported("an interest in a part of a map", str(protocol.get("product", "")))

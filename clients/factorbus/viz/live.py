@@ -101,7 +101,7 @@ class LiveView:
         for name in _PLOTS:
             if name in delta.report:
                 self._to.log(f"plots/{name}", rr.Scalars(float(delta.report[name])))
-        if delta.report:
+        if "strategy" in delta.report:  # that of a part of the map says less
             text = f"{delta.report.get('strategy', '')}: {delta.report.get('because', '')}"
             text += "; converging: further steps follow" if delta.report.get("converging") is True else ""
             far = delta.report.get("converged") is False

@@ -3,6 +3,7 @@
     factorbus/v1/map/<map>/in/<client>                  query        an insert
     factorbus/v1/map/<map>/ask/<question>               query        estimate, chi2, graph, ...: QUESTIONS
     factorbus/v1/map/<map>/out/{delta,snapshot,event}   publication
+    factorbus/v1/map/<map>/out/interest-<id>            publication  of one interest
     factorbus/v1/map/<map>/live/{service,client}/<id>   liveliness token
     factorbus/v1/worker/<id>/job                        query
     factorbus/v1/worker/<id>/live/<slots>               liveliness token
@@ -21,7 +22,10 @@ VERSION = "v1"
 PREFIX = f"factorbus/{VERSION}"
 # The one key that is the same in every version, so that versions can be told apart.
 ANY_SERVICE_OF_ANY_VERSION = "factorbus/*/features/*/live"
-QUESTIONS = ("estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why", "repair")
+QUESTIONS = (
+    "estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why", "repair",
+    "interest",
+)  # fmt: skip
 LONGEST_NAME = 64
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -76,6 +80,11 @@ def delta_key(map_name: str) -> str:
 def snapshot_key(map_name: str) -> str:
     """Where the whole estimate is published now and then."""
     return f"{map_root(map_name)}/out/snapshot"
+
+
+def channel_key(map_name: str, channel: str) -> str:
+    """Where `channel` of a map is published: `delta`, or that of an interest."""
+    return f"{map_root(map_name)}/out/{checked_name('channel', channel)}"
 
 
 def event_key(map_name: str) -> str:

@@ -9,6 +9,7 @@ threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand o
           answers 0..3     answers to questions, which can be large
           computed 0, 1    answers to questions that take long to compute: covariances of many, repair, files
           in-place <kind>  jobs when there is no worker
+          interests        filters what changed for those who follow a part of a map, and sends it
           features         questions of filters: small ones done, large ones cut up and put together
           core 1..         worker threads of eliminations that take long
 """
@@ -42,6 +43,7 @@ from factorbus.service.bus.zenoh_session import (
 )
 from factorbus.service.config import BadConfig, Config, checked_config
 from factorbus.service.core.events import ArrivedQuestion, Asker, Refuse
+from factorbus.service.interests.running import Interests
 from factorbus.service.jobs.features import FeatureLimits, FeatureQuestions
 from factorbus.service.jobs.optima import Optima
 from factorbus.service.jobs.running import Jobs
@@ -136,6 +138,8 @@ class Shell:
         self._delivery = Delivery(config.limits.questions, self._about, self._find_optimum, self._fork)
         executors = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "control": self._control}
         self.health_report = HealthReport(config, self._service, executors, lambda: self.maps.hosts())
+        self._delivery.interests = Interests(config.limits, self.health_report.memory, self._delivery)
+        self.health_report.chapters["interests"] = self._delivery.interests.rows
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._control, self.health_report.memory)
         self.health_report.chapters["protocol"] = known
         self.health_report.chapters["unopened"] = self.maps.unopened

@@ -39,6 +39,8 @@ class Limits:
     waiting_bytes: int = 256 << 20
     changes: int = 64  # inserts with changes of one client, admitted or parked, that have no answer yet
     questions: int = 256  # waiting for the solver to come to a revision
+    interests: int = 64  # different ones that clients follow ...
+    interest_lease_s: float = 30.0  # ... each until nobody has asked about it for so long
     remembered: int = 1024  # answers per client that a repeated sequence number gets again
     step_inserts: int = 64  # inserts that one step takes in ...
     step_bytes: int = 4 << 20  # ... as long as they have no more bytes than so together

@@ -282,6 +282,7 @@ class Maps:
 
         by = self._delivery.of_map(place, more, lambda: made.on_drained())
         host = Host(core, map_solver, by.perform, by.send, by.answer_reads, self._inline_run, by.send_both, kept)
+        by.interests = self._delivery.interests.of_map(name, place, host.read)
         made = OpenMap(host, place, options)
         return made
 

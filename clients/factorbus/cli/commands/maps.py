@@ -9,7 +9,7 @@ from factorbus.cli.process.options import connect_option, json_option, timeout_o
 from factorbus.wording import counted
 
 if TYPE_CHECKING:
-    from factorbus.client.map import MapRow
+    from factorbus.client.map_row import MapRow
 
 
 @click.command()

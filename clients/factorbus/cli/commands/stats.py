@@ -49,8 +49,9 @@ def _of_map(services: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     found = []
     for each in services:
         own = {rows: [row for row in each.get(rows, ()) if row["name"] == name] for rows in ("maps", "unopened")}
+        interests = [row for row in each.get("interests", ()) if row["map"] == name]
         if any(own.values()):
-            found.append(each | own)
+            found.append(each | own | {"interests": interests})
     if not found:
         rows = [row for each in services for row in (*each["maps"], *each.get("unopened", ()))]
         raise UnknownMap(name, sorted(row["name"] for row in rows))
@@ -68,6 +69,8 @@ def _rows(service: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "workers", told or "none: jobs are done in place"
     for row in service["maps"]:
         yield f"map {row['name']}", _map(row)
+    for row in service.get("interests", ()):
+        yield f"interest in {row['map']}", interest_line(row)
     for row in service.get("unopened", ()):
         yield f"map {row['name']}", f"does not open ({row['state']}): {row['problem']}"
     for name, value in shown_fields(service.get("journal", {})):
@@ -88,6 +91,27 @@ def _map(row: Mapping[str, Any]) -> str:
         *(f"journal {name}: {value}" for name, value in shown_fields(row.get("journal", {}))),
     ]
     return "\n".join(lines)
+
+
+def interest_line(row: Mapping[str, Any]) -> str:
+    """An interest, and what its channel has carried."""
+    carried = (counted(row[f"{name}s"], name) for name in ("message", "answer", "byte"))
+    told = f"{', '.join(carried)}, {counted(row['waiting'], 'variable')} waiting"
+    return f"{part_of(row)}, every {row['period_ms']} ms{_bound(row)}: {told}"
+
+
+def part_of(row: Mapping[str, Any]) -> str:
+    """Which part of a map an interest is about."""
+    letters = ", ".join(letter or "no letter" for letter in row["letters"])
+    parts = [letters, ", ".join(row["kinds"]), "box " + " ".join(f"{each:g}" for each in row["box"])]
+    return (
+        "; ".join(part for part, given in zip(parts, (letters, row["kinds"], row["box"]), strict=True) if given)
+        or "all"
+    )
+
+
+def _bound(row: Mapping[str, Any]) -> str:
+    return f", at most {counted(row['bytes_per_s'], 'byte')} a second" if row["bytes_per_s"] else ""
 
 
 def shown_fields(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -35,6 +35,7 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
       step ms    solver's time of a step, mean since the look before
       χ²         converging: left alone, the map goes on by itself to its optimum; gave up: it does not
       waiting    inserts that are accepted by no step yet, and those parked behind a gap
+      interest   a part of a map that clients follow, what its channel carries, and variables that wait for that
       client     those that are there; gone: those that have left, whose inserts are in the map
       answer ms  from asking for these numbers to having them, over the bus
     """
@@ -88,13 +89,15 @@ def view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType":
     head += f"service {seen['service']} {seen['version']}, answers in {seen['answer_ms']:.1f} ms"
     closed = [Text(f"map {line}", style="bold red") for line in seen["unopened"]]
     tables = (_table(console, rows) for rows in (_maps(seen), _clients(seen)))
-    return Group(Text(head, style="bold"), Text(), *closed, *tables, *_gone(seen), _table(console, _workers(seen)))
+    interests = [_table(console, _interests(seen))] if seen["interests"] else []
+    workers = _table(console, _workers(seen))
+    return Group(Text(head, style="bold"), Text(), *closed, *tables, *_gone(seen), *interests, workers)
 
 
 # Columns of each table, the first of which stays; where not all have room the last of these goes first.
 _MATTER = (
     "variables", "revision", "χ²", "step ms", "waiting", "steps/s", "factors", "inserts", "map", "inserts/s", "refused",
-    "mode", "slots", "in flight", "latency ms",
+    "mode", "slots", "in flight", "latency ms", "bytes/s", "at most",
 )  # fmt: skip
 _ANY_WIDTH = 10_000
 _LEFT = ("map", "mode")
@@ -147,6 +150,22 @@ def _gone(seen: dict[str, Any]) -> list["RenderableType"]:
 
 def _inserts(rows: list[dict[str, Any]]) -> int:
     return sum(row["inserts"] for row in rows)
+
+
+def _interests(seen: dict[str, Any]) -> _Table:
+    from factorbus.cli.commands.stats import part_of
+
+    rows = [
+        (
+            part_of(row),
+            row["map"],
+            f"{row['carried_per_s']:,.0f}",
+            f"{row['bytes_per_s']:,}" if row["bytes_per_s"] else "",
+            f"{row['waiting']:,}",
+        )
+        for row in seen["interests"]
+    ]
+    return ("interest", "map", "bytes/s", "at most", "waiting"), rows
 
 
 def _workers(seen: dict[str, Any]) -> _Table:

@@ -10,6 +10,7 @@ import click
 
 from factorbus.cli.output.exits import require
 from factorbus.cli.process.bind_address import insecure_option, refuse_open_page
+from factorbus.cli.process.interest_options import PartOptions, part_options
 from factorbus.cli.process.options import (
     Number,
     connect_option,
@@ -18,6 +19,7 @@ from factorbus.cli.process.options import (
     out_option,
     zenoh_option,
 )
+from factorbus.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +34,18 @@ class ViewOptions:
     insecure: bool
 
 
+@dataclass(frozen=True, slots=True)
+class UntilOptions:
+    """When to stop: at a revision, when standard input closes."""
+
+    until: int | None
+    until_eof: bool
+
+
 @click.command()
 @grouped("viewer", ViewOptions)
+@grouped("part", PartOptions)
+@grouped("end", UntilOptions)
 @click.argument("map_name", metavar="MAP")
 @connect_option
 @zenoh_option
@@ -47,6 +59,7 @@ class ViewOptions:
 @insecure_option
 @click.option("--rate", type=Number(0.1, 60), default=5.0, show_default=True, metavar="HZ", help="Looks a second.")
 @ellipses_option(30)
+@part_options
 @click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
 def command(
@@ -56,16 +69,20 @@ def command(
     viewer: ViewOptions,
     rate: float,
     ellipses: int,
-    until: int | None,
-    until_eof: bool,
+    part: PartOptions,
+    end: UntilOptions,
 ) -> None:
     """Watch MAP live in Rerun: trajectory, landmarks, loop closures by how badly they fit, and plots of every step.
 
     Opens the Rerun viewer; where there is no display, serves it to browsers of this machine, or with --host and
     --insecure to all who can reach that address. A map that is not there yet is waited for. Until Ctrl-C.
 
+    --only, --kind, --box, --period-ms and --bytes-per-s follow a part of the map, for a radio link: the service sends
+    that part alone. Factors and ellipses are not asked for then; what waits for the link is said.
+
     \b
     factorbus watch warehouse
+    factorbus watch warehouse --only x --box=-5,-5,20,20 --bytes-per-s 4000
     factorbus watch warehouse --serve --web-port 9090
     factorbus watch warehouse --serve --host 192.168.1.20 --insecure
     factorbus watch warehouse --save monday.rrd; rerun monday.rrd
@@ -81,10 +98,11 @@ def command(
     from factorbus.viz.live import LiveView
     from factorbus.viz.map_follower import MapFollower
 
+    interest, until = part.interest(), end.until
     with (
-        stop_on_signals(until_eof) as stop,
+        stop_on_signals(end.until_eof) as stop,
         open_bus(endpoint, "watcher", zenoh) as bus,
-        joined_when_there(bus, map_name, stop.wait) as joined,
+        joined_when_there(bus, map_name, stop.wait, interest) as joined,
     ):
         if joined is None:
             print_note(f"stopped before there was a map {map_name}")
@@ -92,7 +110,7 @@ def command(
         view = LiveView(map_name)
         try:
             where = _open(view, viewer)
-            with MapFollower(joined, ellipses=ellipses) as follower:
+            with MapFollower(joined, not interest, 0 if interest else ellipses) as follower:
                 view.show(follower.last_look(joined.timeout_s))
                 click.echo(f"ready {where}")
                 while not stop.wait(1 / rate) and (until is None or joined.estimate.revision < until):
@@ -104,6 +122,9 @@ def command(
     unconverged = ", which had not converged" if joined.estimate.converged is False else ""
     converging = unconverged or (", which was converging" if joined.estimate.converging else "")
     print_note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
+    if interest:
+        told = f"; {counted(joined.estimate.waiting, 'variable')} waiting" if joined.estimate.waiting else ""
+        print_note(f"its part came in {joined.estimate.received_bytes:,} bytes{told}")
 
 
 def _open(view: Any, viewer: ViewOptions) -> str:

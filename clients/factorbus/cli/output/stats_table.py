@@ -17,12 +17,12 @@ class Indicators:
         self._before: dict[tuple[str, int], tuple[float, dict[str, Any]]] = {}
 
     def read(self) -> dict[str, Any]:
-        """For JSON: service, version, answer_ms, maps, unopened, clients, workers.
+        """For JSON: service, version, answer_ms, maps, unopened, clients, workers, interests.
 
         `unavailable` says why there is nothing.
         """
         seen: dict[str, Any] = {"unavailable": "", "service": "", "version": "", "answer_ms": 0.0}
-        seen |= {"maps": [], "unopened": [], "clients": [], "workers": []}
+        seen |= {"maps": [], "unopened": [], "clients": [], "workers": [], "interests": []}
         try:
             start = time.perf_counter()
             rows = self._bus.maps(_ANSWER_S)
@@ -67,6 +67,10 @@ class Indicators:
                 "busy": stats["inserts"]["busy"],
             }
         )
+        carried = {row["channel"]: row["bytes"] for row in before.get("interests", ())}
+        for row in stats.get("interests", ()):
+            fresh = row["bytes"] - carried.get(row["channel"], 0)
+            seen["interests"].append(row | {"map": name, "carried_per_s": max(fresh, 0) / seconds if at < now else 0.0})
         for client, following in sorted(stats["clients"].items()):
             fresh = following - before["clients"].get(client, 1)  # the number that it sends next begins at 1
             # Tokens are optional: who inserts without one is there too.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from factorbus.cli.process.options import MapAddress
 
 if TYPE_CHECKING:
-    from factorbus.client import Bus, Map
+    from factorbus.client import Bus, Interest, Map
 
 _LISTENING_S = 1.0
 
@@ -30,10 +30,12 @@ def joined_map(address: MapAddress, client: str) -> Iterator["Map"]:
 
 
 @contextmanager
-def joined_when_there(bus: "Bus", name: str, stopped: Callable[[float], bool]) -> Iterator["Map | None"]:
+def joined_when_there(
+    bus: "Bus", name: str, stopped: Callable[[float], bool], interest: "Interest | None" = None
+) -> Iterator["Map | None"]:
     """Map `name`, once there is one; None if it was stopped before.  stopped: waits for that many seconds, at most.
 
-    Raises Refused, Unavailable.
+    interest: the part of it to follow.  Raises Refused, Unavailable.
     """
     from factorbus.cli.output.console import print_note
     from factorbus.proto.problems import UnknownMap
@@ -41,7 +43,7 @@ def joined_when_there(bus: "Bus", name: str, stopped: Callable[[float], bool]) -
     said = False
     while True:
         try:
-            joined = bus.map(name, create=False)
+            joined = bus.map(name, create=False, interest=interest)
             break
         except UnknownMap as unknown:
             if not said:

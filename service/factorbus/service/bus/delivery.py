@@ -15,7 +15,8 @@ from typing import Any
 from factorbus.proto import codec
 from factorbus.proto.problems import Busy, Internal, Problem
 from factorbus.service.bus.zenoh_session import MapPlace, refuse, reply
-from factorbus.service.core.events import Answer, Asker, Drained, Effect, Publish, Read, Refuse, Tell
+from factorbus.service.core.events import Answer, Asker, Drained, Effect, Follow, Publish, Read, Refuse, Tell
+from factorbus.service.interests.running import Interests, MapInterests, hand_copy
 from factorbus.service.maps.serial_executor import SerialExecutor, SerialExecutors
 from factorbus.service.questions.answers import Question, QuestionCopies, answer, check_ready, is_computed
 from factorbus.solver.errors import SolverError
@@ -30,8 +31,9 @@ _RETRY_S = 1.0  # where many answers are still to be computed
 class Delivery:
     """The outbox, the executors that answer, that compute answers, that of refusals, and what goes on which.
 
-    most: answers that may wait to be computed.  about: what this service adds to the stats of a map.  batch: finds
-    batch optima; (asker, question, copies).  copied: the same with a copy of a map, which is to be another one.
+    interests: of all maps, to be set.  most: answers that may wait to be computed.  about: what this service adds to
+    the stats of a map.  batch: finds batch optima; (asker, question, copies).  copied: the same with a copy of a map,
+    which is to be another one.
     """
 
     def __init__(
@@ -48,9 +50,13 @@ class Delivery:
         )
         self._computed, self._most = SerialExecutors("computed", _COMPUTERS), most
         self._about, self._batch, self._copied = about, batch, copied
+        self.interests: Interests
 
     def of_map(self, place: MapPlace, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]) -> "MapDelivery":
-        """For a map at `place`; `tell` adds to its stats, `drained` hears that nothing waits any more."""
+        """For a map at `place`; `tell` adds to its stats, `drained` hears that nothing waits any more.
+
+        `interests` of it is to be set, when the map is there that they ask.
+        """
         return MapDelivery(self, place, tell, drained)
 
     def answer(self, asker: Asker, message: bytes) -> None:
@@ -62,7 +68,8 @@ class Delivery:
         self._answers.hand(refuse, asker, problem)
 
     def settle(self) -> None:
-        """Return when all answers that were handed in are sent."""
+        """Return when all answers that were handed in are sent, and interests have ended."""
+        self.interests.close()
         self._computed.settle()
         self._answers.settle()
 
@@ -96,12 +103,15 @@ class Delivery:
                 self.outbox.hand(place.publish, "snapshot", answer(read.question, taken))
             elif read.question.name == "copy":
                 self._copied(read.asker, read.question, taken)
+            elif read.question.name == "interest":
+                hand_copy(read.question, taken)
             elif read.question.batch:
                 self._batch(read.asker, read.question, taken)
             else:
                 reply(read.asker, answer(read.question, taken))
         except (Problem, SolverError) as problem:
-            refuse(read.asker, problem)
+            if read.asker is not None:
+                refuse(read.asker, problem)
         except Exception:
             reference = secrets.token_hex(4)
             log.exception("fault %s: answering %s", reference, read.question.name)
@@ -116,17 +126,24 @@ class MapDelivery:
         self, all_: Delivery, place: MapPlace, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]
     ) -> None:
         self._all, self._place, self._tell, self._drained = all_, place, tell, drained
+        self.interests: MapInterests
 
     def perform(self, effects: list[Effect]) -> None:
         """Hand on what a map wants done: what is to be sent in one piece to the outbox, in order."""
         sending: list[Effect] = []
         for effect in effects:
             if isinstance(effect, Tell):
-                self._all.tell(effect.asker, {**effect.content, **self._tell()})
+                self._all.tell(
+                    effect.asker, {**effect.content, **self._tell(), "interests": self.interests.core.rows()}
+                )
+            elif isinstance(effect, Follow):
+                self.interests.follow(effect)
             elif isinstance(effect, Drained):
+                self.interests.close()
                 self._drained()
             elif isinstance(effect, Refuse):
-                self._all.refusals.hand(refuse, effect.asker, effect.problem, effect.following)
+                if effect.asker is not None:  # else it was the service's own question
+                    self._all.refusals.hand(refuse, effect.asker, effect.problem, effect.following)
             else:
                 sending.append(effect)
         if sending:

@@ -157,14 +157,31 @@ class MapPlace:
             for channel, key in channels.items()
         }
         self._token_key = keys.service_token(name, service)
-        self._session, self._token = session, None
+        self._session, self._token, self._name, self._closed = session, None, name, False
+        self.heard: Callable[[bytes], None] | None = None  # who wants every delta that is published, if anybody
 
     def publish(self, channel: str, message: bytes) -> None:
-        """Publish on `channel` (delta, event, snapshot)."""
+        """Publish on `channel` (delta, event, snapshot; that of an interest begins with its first message)."""
+        publisher = self._channels.get(channel)
         try:
-            self._channels[channel].put(message)
+            if publisher is None:
+                if self._closed:
+                    return
+                publisher = self._channels[channel] = self._session.declare_publisher(
+                    keys.channel_key(self._name, channel),
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    priority=_PRIORITY["delta"],
+                )
+            publisher.put(message)
         except zenoh.ZError as error:
-            log.warning("not published on %s: %s", self._channels[channel].key_expr, error)
+            log.warning("not published on %s of map %s: %s", channel, self._name, error)
+        if channel == "delta" and self.heard is not None:
+            self.heard(message)
+
+    def end_channel(self, channel: str) -> None:
+        """Nothing more is published on it."""
+        if (publisher := self._channels.pop(channel, None)) is not None:
+            publisher.undeclare()
 
     def announce(self) -> None:
         """Declare the token, last of all: alive means askable."""
@@ -178,8 +195,9 @@ class MapPlace:
 
     def close(self) -> None:
         """Undeclare everything."""
+        self._closed = True
         self.withdraw()
-        for publisher in self._channels.values():
+        for publisher in list(self._channels.values()):
             publisher.undeclare()
 
 

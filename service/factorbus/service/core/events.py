@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 from factorbus.proto.arrays import I64
+from factorbus.proto.interest_codec import AskInterest
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Problem, without_frames
 from factorbus.service.questions.answers import Question
@@ -201,8 +202,17 @@ class InsertBatch(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class Follow:
+    """`asker` wants to follow a part of the estimate of the map that `row` describes, as admin/maps does."""
+
+    asker: Asker
+    ask: AskInterest
+    row: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
 class Drained:
     """Nothing is waiting any more and nothing will be taken: the map can be closed."""
 
 
-Effect: TypeAlias = Answer | Tell | Refuse | Publish | InsertBatch | Drained
+Effect: TypeAlias = Answer | Tell | Refuse | Publish | InsertBatch | Follow | Drained

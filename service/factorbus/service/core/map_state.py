@@ -26,6 +26,7 @@ from factorbus.service.core.events import (
     Asker,
     Drained,
     Effect,
+    Follow,
     InsertBatch,
     ParsedInsert,
     Publish,
@@ -43,8 +44,7 @@ from factorbus.service.questions.answers import Question, parse
 
 _SNAPSHOT = Read(Question("snapshot"))
 # An InsertBatch is short when it is for one insert of at most _SHORT_BYTES and none of late took longer than SHORT_S,
-# unless the insert was already on its way when the last InsertBatch ended: then there are likely more behind it, to be
-# applied together.
+# unless the insert was on its way already when the last one ended: then more likely follow, to be applied together.
 _SHORT_BYTES = 16 << 10
 SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
@@ -142,6 +142,8 @@ class MapCore:
             return [Refuse(arrived.asker, problem)]
         if question.name == "stats":
             return [Tell(arrived.asker, self.stats(now))]
+        if question.name == "interest":
+            return [Follow(arrived.asker, question.ask, self.row())]
         return self.read(Read(question, arrived.asker), now)
 
     def read(self, read: Read, now: float) -> list[Effect]:

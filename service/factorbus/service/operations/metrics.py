@@ -93,6 +93,7 @@ def families(health: Mapping[str, Any]) -> Iterator[Family]:
     yield _one("pieces", "counter", "Pieces of eliminations made on other cores than the map's own", cores["pieces"])
     yield from _of_workers(health.get("workers", ()))
     yield from _of_maps(health["maps"])
+    yield from of_interests(health.get("interests", ()))
     yield _one("maps_unopened", "gauge", "Maps on disk that do not open", len(health.get("unopened", ())))
     yield from _extra("disk", "", {"": health.get("disk", {})})
 
@@ -111,6 +112,20 @@ def _of_workers(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
     yield _by("worker_wrong_answers", "counter", "Answers of it that could not be right", "worker", wrong)
     distrusted = {row["name"]: row["distrusted"] for row in rows if "distrusted" in row}
     yield _by("worker_distrusted", "gauge", "1 while it gets no jobs because of that", "worker", distrusted)
+
+
+def of_interests(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
+    """Those of the interests, by map."""
+    rows = list(rows)
+    maps = sorted({row["map"] for row in rows})
+    counts = {each: sum(row["map"] == each for row in rows) for each in maps}
+    yield _by("map_interests", "gauge", "Interests that clients follow", "map", counts)
+    for name, what in (
+        ("bytes", "Bytes that the channels of present interests have carried"),
+        ("waiting", "Variables that wait for what their channel may carry"),
+    ):
+        totals = {each: sum(row[name] for row in rows if row["map"] == each) for each in maps}
+        yield _by(f"map_interest_{name}", "gauge", what, "map", totals)
 
 
 _GAUGES = {

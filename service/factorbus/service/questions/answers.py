@@ -14,6 +14,8 @@ import numpy as np
 from factorbus.proto import codec, fields
 from factorbus.proto.arrays import I64
 from factorbus.proto.asking import AskRepair, Repaired
+from factorbus.proto.interest import InterestFilter
+from factorbus.proto.interest_codec import decode_ask_interest, read_filter
 from factorbus.proto.keys import QUESTIONS
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, MapGraph, Variables
@@ -35,9 +37,9 @@ _UNBOUNDED = Room()
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question, checked.  keys: of an estimate, None for all.  batch, values, timeout_s: of chi2.  format, robot,
-    strict, ids: of export.  ask: of one about uncertainty, and of a copy (which only the service itself asks for), all
-    of it.
+    """One question, checked.  keys, part: of an estimate, None for all.  batch, values, timeout_s: of chi2.
+    format, robot, strict, ids: of export.  ask: of one about uncertainty, of an interest, and of a copy (which only the
+    service itself asks for), all of it.
     """
 
     name: str
@@ -49,6 +51,7 @@ class Question:
     robot: str | None = None
     strict: bool = False
     ids: str = "auto"
+    part: InterestFilter | None = None
     ask: Any = None
 
 
@@ -90,19 +93,32 @@ class QuestionCopies:
 def parse(name: str, payload: bytes) -> Question:
     """The question `name` with the parameters in `payload`.  Raises UnknownQuestion, BadMessage, TooLarge."""
     if name == "estimate":
-        return Question(name, keys=codec.decode_keys_asked(payload))
+        return _estimate(payload)
     if name not in QUESTIONS:
         raise UnknownQuestion(name, f"one of {', '.join(QUESTIONS)}")
     if name in DECODE:
         return Question(name, ask=DECODE[name](payload))
     if name == "repair":
         return Question(name, ask=decode_ask_repair(payload))
+    if name == "interest":
+        return Question(name, ask=decode_ask_interest(payload))
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
     if name == "chi2":
         timeout_s = fields.parameter("question", content, "timeout_s", _WAIT_S, "from 0.001 to 86400 seconds", 60.0)
         batch, values = fields.flag("question", content, "batch"), fields.flag("question", content, "values")
         return Question(name, batch=batch, values=values, timeout_s=timeout_s)
     return _export(content) if name == "export" else Question(name)
+
+
+def _estimate(payload: bytes) -> Question:
+    """The question for values.  Raises BadMessage, BadOption."""
+    keys, part = codec.decode_keys_asked(payload), None
+    if payload:
+        content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
+        part = read_filter(content)
+    if keys is not None and part is not None:
+        raise BadOption("question.keys", "given with a filter", "either of the two")
+    return Question("estimate", keys=keys, part=part)
 
 
 def _export(content: dict[str, Any]) -> Question:
@@ -141,7 +157,7 @@ def snapshot(
     names = {question.name for question in questions}
     whole = bool(names & {"graph", "export"}) or any(q.batch for q in questions)
     variables, factors = solver.graph() if whole else ((), ())
-    if not whole and names & {"estimate", "snapshot"}:
+    if not whole and names & {"estimate", "snapshot", "interest"}:
         variables = solver.estimate()
     chi2 = solver.chi2() if "chi2" in names else 0.0
     asked = [question for question in questions if question.name in DECODE]
@@ -172,10 +188,10 @@ def _refused(solver: Any, questions: Sequence[Question], has_copy: bool, room: R
 def _check(solver: Any, question: Question, has_copy: bool, room: Room) -> None:
     """Is there room for what `question` needs copied, and for its answer?  Raises TooLarge, OutOfMemory."""
     name = question.name
-    if name in ("estimate", "graph", "export") or question.batch:
+    if name in ("estimate", "graph", "export", "interest") or question.batch:
         variables, factors = solver.columns_bytes()
-        size = variables if name == "estimate" else variables + factors
-        if name == "graph" or (name == "estimate" and question.keys is None):
+        size = variables if name in ("estimate", "interest") else variables + factors
+        if name == "graph" or (name == "estimate" and question.keys is None and question.part is None):
             room.fits("the answer", size)
         room.check(COPIES * size)
     elif name == "repair":
@@ -224,6 +240,7 @@ def _answer(question: Question, taken: QuestionCopies) -> bytes:
         return ready if isinstance(ready, bytes) else _uncertain(taken).answer(question.ask)
     if question.name in ("estimate", "snapshot"):
         chosen = taken.variables if question.keys is None else _chosen(taken.variables, question.keys)
+        chosen = chosen if question.part is None else question.part.pick(chosen)
         return codec.encode_estimate(Estimate(taken.epoch, taken.revision, chosen))
     if question.name == "chi2":
         return codec.encode_chi2(Chi2(taken.epoch, taken.revision, taken.chi2))
