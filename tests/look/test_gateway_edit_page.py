@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import needs_browser, page_of
-from gateways import arc, square
+from gateways import Editor, arc, square
 from processes import Process
 
 from factorbus.client import Bus, Draft, connect
@@ -262,3 +262,45 @@ def test_a_map_in_space_is_turned(bus: Bus, gateway: str) -> None:
         assert page.where("x4") != before
         page.click("x2")
         page.headed("x2")
+
+
+def test_a_double_click_is_one_edit_and_what_another_took_out_is_no_longer_selected(bus: Bus, gateway: str) -> None:
+    with bus.map("twice") as joined:
+        joined.insert(square(false_closure=True), settle=True)
+        with edited(gateway, "twice") as page:
+            page.click_between("x2", "x10")
+            page.headed("between_se2")
+            page.page.get_by_role("button", name="reject", exact=True).dblclick()
+            page.headed("Done")
+            assert "rejected between_se2 (x2, x10)" in page.notice("χ²")
+            assert page.page.locator("#edits li:not(.undone)").count() >= 1
+            page.press("undo 1: rejected between_se2 (x2, x10), by local")
+            page.headed("Undone")
+            page.click_between("x2", "x10")
+            page.headed("between_se2")
+            other = Editor(gateway, "twice")
+            other.edit("reject", factors=[other.factor_between("x2", "x10")])
+            page.press("reject")
+            page.notice("[unknown_factor]")
+            assert page.page.locator("#panel h2").count() == 0
+
+
+def test_a_map_that_is_dropped_is_said_to_be_gone_and_one_that_comes_is_live_again(bus: Bus, gateway: str) -> None:
+    def insert() -> None:
+        with bus.map("leaving") as joined:
+            joined.insert(square())
+
+    insert()
+    with edited(gateway, "leaving") as page:
+        state = page.page.locator("#state")
+        state.get_by_text("17 variables").wait_for()
+        bus.drop("leaving")
+        state.get_by_text("has no map leaving any more; this is its revision 1").wait_for()
+        page.click("x4")
+        page.notice("[unavailable]")
+        insert()
+        state.get_by_text("revision 1 · 17 variables").wait_for()
+        with bus.map("later") as joined:
+            joined.insert(arc())
+        page.page.locator("#maps").hover()
+        page.page.locator("#maps option[value=later]").wait_for(state="attached")

@@ -1,7 +1,8 @@
 """Steps of a map to a browser: the whole estimate first, then what changed, as fast as the browser takes it.
 
 Steps that come while a message is under way are sent together, each variable once: who is slow gets fewer messages and
-misses none of the values.
+misses none of the values.  A map that is no more, or a service that is silent, is told as well: what a person looks at
+is never old without a word.
 """
 
 import asyncio
@@ -18,6 +19,8 @@ from factorbus.proto.messages import Delta, Variables
 from factorbus.proto.stamps import NO_STAMP
 
 _LEAST_PAUSE_S = 0.05
+# How often it is looked whether the values are old; shorter than that they may be while a step is on its way.
+_LOOK_S, _OLD_S = 1.0, 2.0
 
 
 async def follow_map(socket: WebSocket, mirror: Mirror) -> None:
@@ -34,11 +37,16 @@ async def follow_map(socket: WebSocket, mirror: Mirror) -> None:
         report = {"converging": True} if mirror.converging else {}
         await _send(socket, {"type": "estimate", **estimate(snapshot), "report": report})
         at = (snapshot.epoch, snapshot.revision)
+        was_old = False
         while not leaving.done():
             waiting = asyncio.ensure_future(news.wait())
-            await asyncio.wait((waiting, leaving), return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait((waiting, leaving), timeout=_LOOK_S, return_when=asyncio.FIRST_COMPLETED)
             waiting.cancel()
             news.clear()
+            old = mirror.stale and (was_old or mirror.age_s > _OLD_S)
+            if old != was_old:
+                was_old = old
+                await _send(socket, {"type": "state", "stale": old, "revision": at[1]})
             deltas = [d for d in iter(stream.try_take, None) if d.epoch != at[0] or d.revision > at[1]]
             if deltas:
                 at = (deltas[-1].epoch, deltas[-1].revision)

@@ -10,6 +10,7 @@ from factorbus.formats.numbering import IDS
 from factorbus.formats.reader import READS, read
 from factorbus.formats.robot_log import FactorLabels, RobotLog
 from factorbus.formats.steps import Steps
+from factorbus.formats.whole_file import write_whole
 from factorbus.formats.writable import Written
 from factorbus.formats.write_g2o import as_g2o, g2o_text, write_g2o
 from factorbus.formats.write_graph import GRAPHS, write_graph
@@ -42,4 +43,5 @@ __all__ = [
     "write_kitti",
     "write_pyfg",
     "write_tum",
+    "write_whole",
 ]

@@ -75,7 +75,7 @@ class GraphFile:
             raise FormatError(self.path, None, "a trajectory, which has no measurements", "a graph, with its factors")
         if not self.batch.factors:
             if not self.poses:
-                raise FormatError(self.path, None, "no pose", "at least one pose to replay")
+                raise FormatError(self.path, None, "no pose", "at least one pose")
             return self.batch, self.factor_lines, ()
         times = () if self.log is None else tuple(labels.stamps for labels in self.log.labels)
         lost = np.concatenate([unnamed(self.batch), lone_bearings(self.batch), lone_ranges(self.batch)])

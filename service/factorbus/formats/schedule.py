@@ -132,7 +132,7 @@ def scheduled(file: str, batch: Batch, names: Roster, use_values: bool = False) 
     pose whose bearing tells where it is (`parallax`), and what only ranges tell of once they determine it (`ranging`).
     """
     if not len(names.pose_at):
-        raise FormatError(file, None, "no pose", "at least one pose to replay")
+        raise FormatError(file, None, "no pose", "at least one pose")
     seeds = _seeds(batch, names)
     root = -1
     if not (names.fixed.any() or seeds.any()):

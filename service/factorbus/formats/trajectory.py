@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from factorbus.formats.errors import FormatError
 from factorbus.formats.left_out import shown
+from factorbus.formats.whole_file import write_whole
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.problems import SeveralRobots
@@ -97,7 +98,7 @@ def write_trajectories(
     files = []
     for letter, rows in found.items():
         file = path.with_name(f"{path.stem}-{letter}{path.suffix}") if letter else path
-        file.write_text(text(rows), encoding="ascii")
+        write_whole(file, text(rows), encoding="ascii")
         files.append(file)
     return files
 

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TextIO
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from factorbus.formats.left_out import LeftOut
 from factorbus.formats.numbering import numbered
 from factorbus.formats.records import G2O, Edge
+from factorbus.formats.whole_file import write_whole
 from factorbus.formats.writable import Form, Written, number_text, writable
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -30,7 +30,7 @@ def write_g2o(
     """Write `batch` to a path or an open text file, as `as_g2o` makes it; returns its notes.  Raises FormatError."""
     written = as_g2o(batch, strict, ids)
     if isinstance(path_or_file, str | os.PathLike):
-        Path(path_or_file).write_text(written.text, encoding="ascii")
+        write_whole(path_or_file, written.text, encoding="ascii")
     else:
         path_or_file.write(written.text)
     return written.notes

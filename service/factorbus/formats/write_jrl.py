@@ -19,6 +19,7 @@ from factorbus.formats.jrl import FACTORS, GTSAM_ORDER, JRL, OUTLIERS, POTENTIAL
 from factorbus.formats.left_out import LeftOut
 from factorbus.formats.robot_log import RobotLog, first_mentions
 from factorbus.formats.weights import doubled_rotations, inverted_weights, unpacked_symmetric
+from factorbus.formats.whole_file import write_whole
 from factorbus.formats.writable import Form, Written, writable
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -55,7 +56,7 @@ def write_jrl(
 ) -> tuple[str, ...]:
     """Write `batch` to a path, as `as_jrl` makes it; returns its notes.  Raises FormatError."""
     written = as_jrl(batch, strict, log, Path(path).stem)
-    Path(path).write_text(written.text, encoding="ascii")
+    write_whole(path, written.text, encoding="ascii")
     return written.notes
 
 

@@ -6,7 +6,6 @@ file has the inverse, so its last digits may differ.
 
 import os
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from factorbus.formats.left_out import LeftOut
 from factorbus.formats.pyfg import FACTORS, PYFG, RANGE, RANGES, VERTICES
 from factorbus.formats.seconds import seconds_text
 from factorbus.formats.weights import doubled_rotations, inverted_weights
+from factorbus.formats.whole_file import write_whole
 from factorbus.formats.writable import Form, Written, number_text, writable
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -35,7 +35,7 @@ _FORM = Form(
 def write_pyfg(path: str | os.PathLike[str], batch: Batch, strict: bool = False) -> tuple[str, ...]:
     """Write `batch` to a path, as `as_pyfg` makes it; returns its notes.  Raises FormatError."""
     written = as_pyfg(batch, strict)
-    Path(path).write_text(written.text, encoding="ascii")
+    write_whole(path, written.text, encoding="ascii")
     return written.notes
 
 

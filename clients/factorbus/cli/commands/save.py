@@ -48,6 +48,7 @@ def command(
         raise click.BadParameter(f"{target} does not end in {', '.join(_WRITES)}", param_hint="FILE")
     check_chosen(target, robot, ids)
     from factorbus.cli.process.bus import open_bus
+    from factorbus.formats import write_whole
 
     form = target.suffix.removeprefix(".")
     with open_bus(endpoint, "save", zenoh, timeout_s) as bus, bus.map(name, mirror=False, create=False) as joined:
@@ -59,7 +60,8 @@ def command(
         )
     for letter, text in texts.items():
         path = target if len(texts) == 1 else target.with_name(f"{target.stem}-{letter or 'none'}{target.suffix}")
-        _write(path, text)
+        with output_file(path):
+            write_whole(path, text)
         click.echo(path)
 
 
@@ -81,15 +83,3 @@ def _robots(joined: "Map", robot: str | None) -> list[str]:
         verb = "is" if len(there) < 2 and there != [""] else "are"
         raise Stopped("several_robots", f"map {joined.name!r} has no robot {robot!r}; there {verb} {told}", REFUSED)
     return [robot]
-
-
-def _write(path: Path, text: str) -> None:
-    """Whole or not at all.  Raises Stopped."""
-    beside = path.with_name(f".{path.name}.part")
-    with output_file(path):
-        try:
-            beside.write_text(text, encoding="utf-8")
-            beside.replace(path)
-        except OSError:
-            beside.unlink(missing_ok=True)
-            raise

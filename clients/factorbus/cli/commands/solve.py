@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from factorbus.cli.driving.solving import SolveRequest
 from factorbus.cli.output.exits import FAILED, OK, require
@@ -39,7 +40,7 @@ def _covariance(ctx: click.Context, parameter: click.Parameter, text: str | None
     if text.endswith(".csv"):
         return checked_output(ctx, parameter, Path(text))
     try:
-        return tuple(parse_symbol(each) for each in text.split(","))
+        return tuple(parse_symbol(each.strip()) for each in text.split(","))
     except BadSymbol as problem:
         raise click.BadParameter(f"{problem}; or a file, FILE.csv", param=parameter) from problem
 
@@ -94,10 +95,14 @@ def command(request: SolveRequest, as_json: bool) -> int:
     \b
     In the result:
       starts       χ² of each start;  start: the one whose end is lowest
-      chi2         Σ rᵀ Ω r at the end;  left: what one more Gauss-Newton step would take off it, predicted
+      chi2         Σ rᵀ Ω r at the end, of a factor with a loss ρ(rᵀ Ω r)
+      left         what one more Gauss-Newton step would take off it, predicted
       seconds      search: from the graph in memory to the optimum in memory, loading the solver's kernels included
     The exit code is 1 where the search has ended before it had converged.
     """
+    given = click.get_current_context().get_parameter_source("probability")
+    if given is ParameterSource.COMMANDLINE and not request.gnc:
+        raise click.UsageError("--probability is of --gnc, which looks for false factors; give both, or neither")
     require("service", "factorbus solve")
     from factorbus.cli.driving.solving import run_solve, solution_rows
     from factorbus.cli.output import console as screen

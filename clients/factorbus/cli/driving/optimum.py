@@ -1,7 +1,7 @@
 """The optimum of a whole graph, found in this process: for `solve`, `plot map --solve`, and what is held against it."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -62,12 +62,14 @@ def with_loss_on_loops(graph: Batch, loss: str, scale: float) -> tuple[Batch, in
     return Batch(graph.variables, tuple(factors)), changed
 
 
-def without_false(graph: Batch, probability: float) -> tuple[Batch, FalseFactors]:
+def without_false(
+    graph: Batch, probability: float, memory_limit_bytes: int | None = None, events: BatchEvents | None = None
+) -> tuple[Batch, FalseFactors]:
     """The graph without the false ones among the factors that close loops, at where the others lead.
 
-    Raises SolverError.
+    memory_limit_bytes, events: of the search before, for where the graph roughly lies.  Raises SolverError.
     """
-    _, near = optimum_of(graph, _ROUGHLY)
+    _, near = optimum_of(graph, replace(_ROUGHLY, memory_limit_bytes=memory_limit_bytes), events)
     found = repair(_admitted(near), probability=probability)
     false, factors, at = np.zeros(graph.factor_count, bool), [], 0
     false[found.false] = True

@@ -46,6 +46,7 @@ class SolveRequest:
 def run_solve(request: SolveRequest) -> dict[str, Any]:
     """Do it, with progress on standard error; returns the document.  Raises Stopped, FormatError, SolverError."""
     from factorbus.cli.driving.optimum import WorkerCores, optimum_of, with_loss_on_loops, without_false
+    from factorbus.formats import write_whole
     from factorbus.service.process.memory import available
     from factorbus.solver import BatchSearch
 
@@ -60,11 +61,16 @@ def run_solve(request: SolveRequest) -> dict[str, Any]:
         )
         result["loss"] = {"name": request.loss[0], "scale": request.loss[1], "factors": count}
     with WorkerCores(request.cores) as cores:
+        if request.cores and request.cores > cores.cores:
+            print_note(f"--cores {request.cores}: there are {cores.cores} here, all of which are used")
         search = BatchSearch(_START.get(request.start, request.start), request.max_iterations, False, available())
-        if request.gnc:
-            graph, false = _timed(seconds, "gnc", lambda: without_false(graph, request.probability))
-            result["gnc"] = _told(false.suspects, false.rows)
         events = _Said(cores, search.memory_limit_bytes or 0)
+        if request.gnc:
+            print_note("graduated non-convexity: first roughly, with all factors")
+            graph, false = _timed(
+                seconds, "gnc", lambda: without_false(graph, request.probability, search.memory_limit_bytes, events)
+            )
+            result["gnc"] = _told(false.suspects, false.rows)
         found, solved = _timed(seconds, "search", lambda: optimum_of(graph, search, events))
     result |= {
         "starts": {_WORDS.get(name, name): chi2 for name, chi2 in found.starts.items()},
@@ -78,17 +84,15 @@ def run_solve(request: SolveRequest) -> dict[str, Any]:
     }
     if not found.converged:
         print_note(f"{NOT_CONVERGED}; --max-iterations, or another --start")
-    written = []
+    written = _write(request.out, solved, source, request.strict) if request.out else []
     if request.covariance is not None:
         rows = _timed(seconds, "covariance", lambda: _covariances(solved, request.covariance))
         if isinstance(request.covariance, Path):
             with output_file(request.covariance):
-                request.covariance.write_text(_csv(rows))
+                write_whole(request.covariance, _csv(rows))
             written.append(request.covariance)
         else:
             result["covariance"] = {name: block.tolist() for name, _, block in rows}
-    if request.out:
-        written += _write(request.out, solved, source, request.strict)
     return result | {"seconds": seconds, "written": [str(path) for path in written]}
 
 
@@ -122,7 +126,9 @@ class _Said:
         self._cores, self._limit, self.memory_bytes = cores, limit, 0
 
     def on_memory(self, memory_bytes: int) -> None:
-        self.memory_bytes = memory_bytes
+        known, self.memory_bytes = self.memory_bytes, max(memory_bytes, self.memory_bytes)
+        if memory_bytes <= known:
+            return  # without the false factors: as said for all
         print_note(f"memory: {_megabytes(memory_bytes)} needed, {_megabytes(self._limit)} there")
         if memory_bytes <= self._limit:
             self._cores.start(memory_bytes)
@@ -188,7 +194,7 @@ def _covariances(graph: Batch, wanted: Path | tuple[int, ...] | None) -> list[tu
     if isinstance(wanted, tuple):
         keys = np.array(wanted, np.int64)
     else:
-        keys = np.concatenate([group.keys for group in graph.variables if not group.fixed])
+        keys = np.concatenate([np.empty(0, np.int64), *(g.keys for g in graph.variables if not g.fixed)])
     found = covariances_at(graph, keys)
     return [(format_symbol(key), kinds[key], found[key]) for key in keys.tolist()]
 

@@ -142,7 +142,8 @@ def out_option(flag: str, name: str, text: str, metavar: str) -> Callable[[F], F
     endings = PICTURES if set(named) & set(PICTURES) else named
 
     def checked(ctx: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
-        if path is not None and endings and path.suffix.lower() not in endings:
+        ending = "" if path is None else path.suffix.lower() if endings is PICTURES else path.suffix
+        if path is not None and endings and ending not in endings:
             raise click.BadParameter(f"{path} does not end in {' or '.join(endings)}", param=parameter)
         return checked_output(ctx, parameter, path)
 

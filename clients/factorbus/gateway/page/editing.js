@@ -5,6 +5,8 @@ import { app, button, element, of } from "./app.js";
 
 const SHOWN = 12; // edits of the list
 const SILENT = ["unavailable", "internal"]; // nobody has said that it was refused
+const GONE = ["unknown_factor", "unknown_variable"]; // somebody else was faster
+let underWay = false;
 
 export function notice(text, code = "") {
   of("notice").textContent = code ? `${text} [${code}]` : text;
@@ -37,8 +39,14 @@ export function signInOrOut() {
   return loadSession().then(() => app.select?.());
 }
 
-// Sends it; the answer, or null after saying why not.  Nothing is changed then.
+// Sends it; the answer, or null after saying why not.  Nothing is changed then.  One at a time: a second click on a button
+// is no second edit.
 export async function edit(content) {
+  if (underWay) {
+    notice("the edit before is under way; press again when it is done");
+    return null;
+  }
+  underWay = true;
   notice("sent");
   try {
     const made = await send(app.map.name, content, app.session.token);
@@ -50,8 +58,13 @@ export async function edit(content) {
     const known = error instanceof Refusal && !SILENT.includes(error.code);
     notice(`${known ? "Nothing was changed" : "It is not known whether it was done, look at the map"}: ${error.message}`, error.code ?? "unavailable");
     if (error.code === "not_allowed") loadSession();
+    if (GONE.includes(error.code)) {
+      app.selection.clear();
+      of("panel").replaceChildren();
+    }
     return null;
   } finally {
+    underWay = false;
     app.redraw();
     loadEdits();
   }

@@ -86,6 +86,7 @@ async function edges() {
 
 async function clicked(x, y, event) {
   if (!app.map) return;
+  if (app.map.state !== "live") notice(app.map.state, "unavailable");
   if (app.mode?.merge) { clickedHere(view.nearest(app.map, x, y)[0]); return; }
   if (placed(x, y)) return;
   const more = event.shiftKey;
@@ -120,6 +121,18 @@ function option(row) {
   return made;
 }
 
+// The names again, when one is about to choose: maps come and go.
+async function listAgain() {
+  try {
+    const rows = (await ask("/api/maps")).maps, name = app.map?.name;
+    if (!rows.some((row) => row.name === name)) return;
+    of("maps").replaceChildren(...rows.map(option));
+    of("maps").value = name;
+  } catch (error) {
+    of("maps").title = error.message; // those that are listed can be chosen all the same
+  }
+}
+
 async function list() {
   const wanted = decodeURIComponent(location.hash.slice(1));
   try {
@@ -152,6 +165,7 @@ function search(event) {
   choose(key);
 }
 
+of("maps").onpointerenter = of("maps").onfocus = listAgain;
 of("maps").onchange = (e) => show(e.target.value);
 of("plane").onchange = (e) => { view.seen.look(e.target.value); view.follow = true; app.redraw(); };
 of("fit").onclick = () => { view.follow = true; app.redraw(); };

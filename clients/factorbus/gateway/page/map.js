@@ -33,8 +33,13 @@ export class LiveMap {
     this.socket.close();
   }
 
-  // An estimate brings everything; a delta what changed.  Of an estimate of the same map it is seen what did.
+  // A state says whether the values are old.  An estimate brings everything; a delta what changed.  Of an estimate of the same map it is seen what did.
   take(message) {
+    if (message.type === "state") {
+      this.state = message.stale ? `not live: the service is silent, or has no map ${this.name} any more; this is its revision ${message.revision}` : "live";
+      this.changed();
+      return;
+    }
     const before = this.variables, same = this.epoch === message.epoch;
     if (message.type === "estimate") this.variables = new Map();
     this.touched = new Set();

@@ -206,7 +206,10 @@ def _is_optimum(problem: LeastSquares, result: Minimization, rule: StoppingRule)
     """Whether an undamped step would gain nothing, by a factor that is made for that."""
     result.factorizations += 1
     if problem.factorize(0.0) >= 0:
-        return False
+        if result.chi2 > rule.floor:
+            return False
+        result.left = result.chi2  # a step takes off no more than all of it
+        return True
     result.left = problem.decrease()
     return rule.is_negligible(result.left, result.chi2)
 

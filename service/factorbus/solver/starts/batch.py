@@ -14,7 +14,7 @@ from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.averaged import averaged
-from factorbus.solver.starts.descent import NOTHING, Descent, Descents, are_close
+from factorbus.solver.starts.descent import NOTHING, Descent, Descents
 from factorbus.solver.starts.search import (
     BEST,
     ODOMETRY,
@@ -101,8 +101,8 @@ def _begun(descents: Descents, given: bool, wanted: str) -> list[Descent]:
         raise failed or BadOption(
             "start", repr(wanted), "odometry or the values given: nothing here holds the rotations of all poses"
         )
-    begun.sort(key=lambda each: (each.chi2 if each.chi2 > NOTHING else 0.0, STARTS.index(each.start)))
-    return [each for n, each in enumerate(begun) if not any(_is_beside(each, lower) for lower in begun[:n])]
+    begun.sort(key=lambda each: (_rounded(each.chi2), STARTS.index(each.start)))
+    return [each for n, each in enumerate(begun) if not any(_is_beside(descents, each, lower) for lower in begun[:n])]
 
 
 def _values_of_starts(graph: FactorGraph, given: bool, wanted: str) -> Iterator[tuple[str, F64]]:
@@ -114,9 +114,14 @@ def _values_of_starts(graph: FactorGraph, given: bool, wanted: str) -> Iterator[
         yield from ((ROTATIONS, values) for values in averaged(graph))
 
 
-def _is_beside(descent: Descent, lower: Descent) -> bool:
+def _rounded(chi2: float) -> float:
+    """χ² without the digits in which the same place differs by the order of its sums."""
+    return float(f"{chi2:.9g}") if chi2 > NOTHING else 0.0
+
+
+def _is_beside(descents: Descents, descent: Descent, lower: Descent) -> bool:
     """Whether a start adds nothing to one that begins lower: it begins in the same place, or is of the same sort."""
-    return descent.start == lower.start or are_close(descent.values, lower.values)
+    return descent.start == lower.start or descents.are_close(descent.values, lower.values)
 
 
 def _composed(graph: FactorGraph) -> F64:

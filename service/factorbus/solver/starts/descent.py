@@ -20,6 +20,7 @@ from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
 from factorbus.solver.sparse.elimination import Elimination
+from factorbus.solver.starts.same_place import SamePlace
 from factorbus.solver.starts.search import ROTATIONS, STARTS, BatchEvents, BatchSearch, NoEvents
 from factorbus.solver.tuning import Tuning
 
@@ -28,9 +29,9 @@ _POLISH = 100
 _UNPOLISHED = 1e-11
 # Tries at a time: of the lowest start first, of others; and at most of one that is not the best when another converged.
 _FIRST_CHUNK, _CHUNK, _MOST_OF_OTHERS = 8, 4, 60
-# Two starts are on the way to the same optimum when no value differs by more than this share of how far they reach, or
-# χ² by less than _SAME_CHI2 of it while it falls by less than _SLOW in a chunk.
-_SAME, _SAME_CHI2, _SLOW = 2e-3, 1e-3, 1e-2
+# Two starts are on the way to the same optimum when they are in the same place (`SamePlace`), or differ in χ² by less
+# than _SAME_CHI2 of it while it falls by less than _SLOW in a chunk.
+_SAME_CHI2, _SLOW = 1e-3, 1e-2
 # A start is hopeless if this number of chunks as good as its last one would not bring it below the best; and where two
 # starts have met, one that is this many times above them after its first chunk.
 _PATIENCE, _FAR = 2, 2.0
@@ -80,6 +81,7 @@ class Descents:
         self._hills = tuning.max_nonmonotone_steps
         self._search, self._events = search, events
         self.graph, none = graph, (0,) * at.COUNTS
+        self.are_close = SamePlace(graph)
         self._system = System(graph, Incremental(Elimination(options), options))
         self._suspects = find_undetermined(graph, none)
         if self._suspects.size and (free := find_unanchored(graph, none)) >= 0:
@@ -125,7 +127,7 @@ class Descents:
                     failed = failed or problem
                     descents.remove(each)
                     continue
-                over = [_is_over(each, other) for other in descents if other is not each]
+                over = [self._is_over(each, other) for other in descents if other is not each]
                 each.ended = True in over or each.converged or each.tries >= self._search.max_iterations
         if failed is not None and not descents:
             raise failed
@@ -155,6 +157,20 @@ class Descents:
         descent.tries += tries
         descent.converged, descent.left = result.converged, result.left
 
+    def _is_over(self, descent: Descent, other: Descent) -> bool:
+        """Whether `other` makes it needless to go on."""
+        if not other.tries or descent.chi2 < other.chi2:
+            return False
+        level = descent.chi2 <= (1.0 + _SAME_CHI2) * other.chi2 and (descent.converged or descent.rate < 1.0 + _SLOW)
+        if self.are_close(descent.values, other.values) or (other.converged and level):
+            other.met = True
+            return True
+        if other.converged and descent.tries >= _MOST_OF_OTHERS:
+            return True
+        if other.met and descent.chi2 > _FAR * other.chi2:
+            return True
+        return descent.tries > _CHUNK and descent.chi2 > other.chi2 * descent.rate**_PATIENCE
+
     def _telling(self, descent: Descent) -> Callable[[Minimization], None]:
         before = descent.iterations
 
@@ -173,24 +189,3 @@ def _is_hopeless(descent: Descent, other: Descent) -> bool:
         and not descent.tries
         and descent.chi2 > _ABOVE * other.chi2
     )
-
-
-def _is_over(descent: Descent, other: Descent) -> bool:
-    """Whether `other` makes it needless to go on."""
-    if not other.tries or descent.chi2 < other.chi2:
-        return False
-    level = descent.chi2 <= (1.0 + _SAME_CHI2) * other.chi2 and (descent.converged or descent.rate < 1.0 + _SLOW)
-    if are_close(descent.values, other.values) or (other.converged and level):
-        other.met = True
-        return True
-    if other.converged and descent.tries >= _MOST_OF_OTHERS:
-        return True
-    if other.met and descent.chi2 > _FAR * other.chi2:
-        return True
-    return descent.tries > _CHUNK and descent.chi2 > other.chi2 * descent.rate**_PATIENCE
-
-
-def are_close(first: F64, second: F64) -> bool:
-    """Whether no value differs by more than a small share of how far they reach."""
-    reach = float(np.sqrt(np.mean(np.square(second - second.mean())))) if second.size else 0.0
-    return bool(np.abs(first - second).max(initial=0.0) <= _SAME * reach)
