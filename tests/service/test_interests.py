@@ -308,3 +308,16 @@ def test_metrics_count_interests_by_map() -> None:
     assert samples["map_interests"] == [(("m",), 2)]
     assert samples["map_interest_bytes"] == [(("m",), sum(row["bytes"] for row in rows))]
     assert samples["map_interest_waiting"] == [(("m",), 0)]
+
+
+def test_who_missed_that_something_left_is_told_so() -> None:
+    world = World()
+    service = Service(world)
+    service.step(world.step(drive(world, 5)))
+    follower = following(service, Interest(box=(0, -1, 9, 1), period_ms=10))
+    follower.deaf = 1
+    service.step(world.step({("se2", symbol("x", 2)): pose(50.0)}))
+    service.wait(0.1)
+    assert ("se2", symbol("x", 2)) in follower.values
+    service.ask(follower)
+    assert follower.values == part(follower.interest, world.values)
