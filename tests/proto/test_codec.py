@@ -37,6 +37,7 @@ from factorbus.proto.stamps import NO_STAMP
 VECTORS = Path(__file__).parents[2] / "proto" / "vectors"
 MAKE = runpy.run_path(str(VECTORS / "make.py"))
 GOLDEN: dict[str, bytes] = MAKE["vectors"]()
+INTERESTS = ("ask_interest", "interest_answer", "interest_delta")
 
 ENCODERS: dict[str, Callable[[Any], bytes]] = {
     "insert": codec.encode_insert,
@@ -50,9 +51,7 @@ ENCODERS: dict[str, Callable[[Any], bytes]] = {
     "optimum": codec.encode_optimum,
     "problem": codec.encode_problem,
     "ask_estimate": codec.encode_keys_asked,
-    "ask_interest": interest_codec.encode_ask_interest,
-    "interest_answer": interest_codec.encode_interest_answer,
-    "interest_delta": interest_codec.encode_interest_delta,
+    **{name: getattr(interest_codec, f"encode_{name}") for name in INTERESTS},
 }
 DECODERS: dict[str, Callable[[bytes], Any]] = {
     "insert": codec.decode_insert,
@@ -66,9 +65,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "optimum": codec.decode_optimum,
     "problem": codec.decode_problem,
     "ask_estimate": codec.decode_keys_asked,
-    "ask_interest": interest_codec.decode_ask_interest,
-    "interest_answer": interest_codec.decode_interest_answer,
-    "interest_delta": interest_codec.decode_interest_delta,
+    **{name: getattr(interest_codec, f"decode_{name}") for name in INTERESTS},
     "map": codec.decode_map,
 }
 
