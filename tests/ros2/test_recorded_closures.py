@@ -125,7 +125,8 @@ def test_an_imu_is_named_as_not_used(tmp_path: Path) -> None:
     messages = survey.said(MADE)[:20]
     said = [*messages, Said("/imu/data", "sensor_msgs/msg/Imu", survey.at(1), messages[0].message)]
     made = recorded(tmp_path / "imu.mcap", said)
-    assert "left out, as there is no factor of it from ROS: /imu/data (sensor_msgs/msg/Imu)" in made.notes
+    takes = "--space --imu /imu/data takes its raw samples"
+    assert f"IMU left out: /imu/data; {takes}, where odometry was not made of them already" in made.notes
 
 
 def test_a_topic_of_another_type_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
