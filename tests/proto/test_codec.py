@@ -31,7 +31,7 @@ from factorbus.proto.messages import (
     Optimum,
     Variables,
 )
-from factorbus.proto.problems import BadMessage, Problem, Refused, TooLarge, UnknownKind, UnknownMap
+from factorbus.proto.problems import BadMessage, Problem, Refused, TooLarge, UnknownMap
 from factorbus.proto.stamps import NO_STAMP
 
 VECTORS = Path(__file__).parents[2] / "proto" / "vectors"
@@ -379,24 +379,3 @@ def test_a_documented_field_of_a_report_can_always_be_asked_for() -> None:
         assert name not in accepted.report
     with pytest.raises(KeyError):
         accepted.report["chi"]
-
-
-@pytest.mark.parametrize(
-    ("kind", "why"),
-    [
-        ("linear_9_se2", "one more: 1 to 4"),
-        ("linear_0_se2", "a number of rows from 1 on"),
-        ("linear_3_velocity", "'velocity' is no kind of variable"),
-        ("linear_1" + 129 * "_se2", "1 to 128 variables"),
-        ("linear_1" + 10_000 * "_se2", "of up to 128 variables"),
-    ],
-)
-def test_a_linear_kind_that_there_is_not_is_refused_with_what_is_wrong(kind: str, why: str) -> None:
-    keys, numbers = np.zeros((1, 1), np.int64), np.zeros((1, 1))
-    sent = codec.encode_insert(Insert(1, Batch(factors=(Factors(kind, keys, numbers, numbers),))))
-    with pytest.raises(UnknownKind) as refused:
-        codec.decode_insert(sent)
-    assert why in str(refused.value)
-    assert len(str(refused.value)) < 500
-    assert kind not in FACTOR_KINDS
-    assert FACTOR_KINDS.get(kind) is None

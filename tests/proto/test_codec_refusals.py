@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from factorbus.proto import codec
+from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.limits import MessageLimits
 from factorbus.proto.messages import Batch, Factors, Insert, Variables
 from factorbus.proto.problems import BadMessage, BadStamp, TooLarge, UnknownKind
@@ -174,3 +175,24 @@ def test_whole_numbers_of_other_types_are_taken() -> None:
             codec.encode_insert(Insert(1, Batch((Variables("se2", column, None, False, column),))))
         )
         assert read.batch.variables[0].keys.tolist() == read.batch.variables[0].stamps.tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("linear_9_se2", "one more: 1 to 4"),
+        ("linear_0_se2", "a number of rows from 1 on"),
+        ("linear_3_velocity", "'velocity' is no kind of variable"),
+        ("linear_1" + 129 * "_se2", "1 to 128 variables"),
+        ("linear_1" + 10_000 * "_se2", "of up to 128 variables"),
+    ],
+)
+def test_a_linear_kind_that_there_is_not_is_refused_with_what_is_wrong(kind: str, why: str) -> None:
+    keys, numbers = np.zeros((1, 1), np.int64), np.zeros((1, 1))
+    sent = codec.encode_insert(Insert(1, Batch(factors=(Factors(kind, keys, numbers, numbers),))))
+    with pytest.raises(UnknownKind) as refused:
+        codec.decode_insert(sent)
+    assert why in str(refused.value)
+    assert len(str(refused.value)) < 500
+    assert kind not in FACTOR_KINDS
+    assert FACTOR_KINDS.get(kind) is None
