@@ -20,6 +20,7 @@ SEEN: dict[str, Any] = {
         {"name": "b", "map": "hall", "inserts": 1, "inserts_per_s": 0.0, "here": False},
     ],
     "workers": [{"name": "w", "slots": 1, "in_flight": 0, "latency_ms": 12.5}],
+    "interests": [],
 }  # fmt: skip
 
 

@@ -56,7 +56,7 @@ class MergeOptions:
 @click.option(
     "--align",
     "candidates",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=click.Path(path_type=Path),
     metavar="FILE",
     help="Candidates, of which many may be false: a line POSE OTHERS Z [SIGMAS] for each, numbers as for --anchor.",
 )
@@ -135,7 +135,11 @@ def _candidates(file: Path, sigmas: str | None) -> Any:
     from factorbus.client import Draft
 
     draft, usual = Draft(), None if sigmas is None else _numbers("--sigmas", sigmas)
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as problem:
+        raise click.UsageError(f"--align {file}: {problem}; wanted a text file, a line for each candidate") from problem
+    for number, line in enumerate(text.splitlines(), 1):
         fields = line.partition("#")[0].split()
         if not fields:
             continue
