@@ -4,7 +4,7 @@
 
 Each draw is two robots in a town drawn anew (`two_maps`); seeds are printed.  Worlds:
 
-    plane, space   twelve right candidates, and so many false ones anywhere that they are `false_share` of all
+    plane, space   twelve right candidates, and eighteen false ones anywhere
     few            four right ones and six false ones
     alike          twelve right ones, and nine that agree on another frame, as where two places look alike
     nothing        thirty false ones

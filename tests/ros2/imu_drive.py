@@ -28,7 +28,7 @@ _EVERY = 20  # samples between two odometries
 
 
 class ImuDrive(NamedTuple):
-    """imu (n, 7): seconds, rates and accelerations along the IMU's axes.  odometry: (time, pose as told), truth (k, 7).
+    """imu (n, 7): seconds, rates and accelerations along the IMU's axes.  odometry: (time, measured), truth (k, 7).
 
     bias (6,): at the beginning, along the IMU's axes.
     """

@@ -146,7 +146,7 @@ def test_what_is_in_no_interest_is_not_sent() -> None:
         service.wait(0.1)
     assert service.sent == []
     service.ask(follower)
-    assert follower.following.revision == world.revision, "and who asks is told that nothing is missing"
+    assert follower.following.revision == world.revision, "and the answer says that nothing is missing"
 
 
 @pytest.mark.parametrize("bound", [1000, 3000, 20_000])

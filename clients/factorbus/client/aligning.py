@@ -105,7 +105,8 @@ def align(
 
     candidates: `between_se2` or `between_se3` between a pose of `here` and one of `other` under its new key, 500 at
     most; their certainty is that of a right one.  letters: new ones of the other's keys, as for `merge`.
-    Nothing is changed.  Raises CannotMerge (no such candidates), BadOption, BadSymbol, Refused, Unavailable.
+    Nothing is changed.  Poses and covariances are asked for one after the other: let nobody insert meanwhile.
+    Raises CannotMerge (no such candidates), BadOption, BadSymbol, Refused, Unavailable.
     """
     of_type("here", here, Map, "a Map")
     of_type("other", other, Map, "a Map")

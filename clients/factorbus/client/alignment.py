@@ -63,7 +63,7 @@ class AgreeingSet:
 
     members (m,): which, ascending.  T: T_a_b, a matrix.  reference: the member in their midst.  covariance (d, d): of
     the pose B of the reference as seen from its pose A, in the tangent space of that, metres and radians.
-    by_chance: how many sets of this size are expected among so many candidates, were all of them false.
+    by_chance: how many sets of this size are expected among as many candidates, were all of them false.
     """
 
     members: I64
@@ -332,7 +332,7 @@ def _chance(c: CandidatePoses, residuals: _Residuals) -> float:
 
 
 def _expected_by_chance(count: int, places: int, chance: float) -> float:
-    """How many sets of so many places: the first is anywhere, each further one where that is."""
+    """The expected number of sets of `places` among `count` false candidates: the first is anywhere, others agree."""
     if places < 1:
         return math.inf
     logarithm = math.lgamma(count + 1) - math.lgamma(places + 1) - math.lgamma(count - places + 1)

@@ -81,7 +81,7 @@ class Bus:
 
         window: inserts that may be unanswered at a time.  mirror: keep a live copy of the estimate; returns once
         it is there.  client: who inserts into this map, where one connection is used for several; empty: that of
-        `connect`.  interest: mirror these variables alone, so fast; `insert` does not wait until the mirror has them.
+        `connect`.  interest: mirror these variables alone, at its rate; `insert` does not wait until they are there.
         Raises Refused, Unavailable, BadName, BadOption, UnknownKind, UnknownMap, NotSupported.
         """
         keys.checked_name("map", name)

@@ -1,8 +1,8 @@
 """Steps of a map to a browser: the whole estimate first, then what changed, as fast as the browser takes it.
 
 Steps that come while a message is under way are sent together, each variable once: who is slow gets fewer messages and
-misses none of the values.  A map that is no more, or a service that is silent, is told as well: what a person looks at
-is never old without a word.
+misses none of the values.  A map that is no more, or a service that is silent, is reported as well: what a person
+looks at is never old without a word.
 """
 
 import asyncio

@@ -138,11 +138,7 @@ def decode_interest_answer(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -
         number=fields.integer("", content, "number"),
         lease_s=fields.number("", content, "lease_s"),
         whole=fields.flag("", content, "whole"),
-        variables=read_values(content),
-        gone=_read_gone(content),
-        waiting=fields.integer("", content, "waiting", default=0),
-        converged=_optional_flag(content, "converged"),
-        converging=_optional_flag(content, "converging"),
+        **_read_variables_part(content),
     )
 
 
@@ -160,16 +156,23 @@ def decode_interest_delta(data: bytes, limits: MessageLimits = ANSWER_LIMITS) ->
         previous=fields.integer("", content, "previous"),
         stream=fields.integer("", content, "stream"),
         number=fields.integer("", content, "number"),
-        variables=read_values(content),
-        gone=_read_gone(content),
-        waiting=fields.integer("", content, "waiting", default=0),
-        converged=_optional_flag(content, "converged"),
-        converging=_optional_flag(content, "converging"),
+        **_read_variables_part(content),
     )
 
 
 _ANSWER_FIELDS = ("epoch", "revision", "channel", "stream", "number", "lease_s")
 _DELTA_FIELDS = ("epoch", "revision", "previous", "stream", "number")
+
+
+def _read_variables_part(content: fields.Map) -> dict[str, Any]:
+    """What an answer and a message of the channel have alike."""
+    return {
+        "variables": read_values(content),
+        "gone": _read_gone(content),
+        "waiting": fields.integer("", content, "waiting", default=0),
+        "converged": _optional_flag(content, "converged"),
+        "converging": _optional_flag(content, "converging"),
+    }
 
 
 def _variables_part(message: InterestAnswer | InterestDelta) -> dict[str, Any]:

@@ -45,7 +45,7 @@ class EndChannel:
 class InterestCore:
     """Of one map.  Every method takes an event and returns effects, in order.
 
-    new_stream: a number that no channel had before.  check: raises where there is no memory for so many bytes.
+    new_stream: a number that no channel had before.  check: raises where there is no memory for that number of bytes.
     """
 
     def __init__(

@@ -148,7 +148,7 @@ class InterestMarks:
         }
 
     def missed_gone(self, number: int, tables: InterestTables) -> tuple[Variables, ...]:
-        """Those of which was told after message `number` that they have left."""
+        """The variables that left in messages after `number`."""
         gone: dict[str, list[I64]] = {}
         for kind, marks in self._kinds.items():
             n = marks.count

@@ -107,6 +107,7 @@ class OurLower(Lower):
         kinds = getattr(kind, "types", (kind,))
         dense = isinstance(array, types.Array) and array.layout == "C" and len(kinds) == array.ndim
         if not dense or not all(isinstance(one, types.Integer) for one in kinds):
+            # Not a path that is missing: a kernel whose index counts from the end is refused when it is compiled.
             if any(getattr(one, "literal_value", 0) < 0 for one in getattr(kind, "types", ())):
                 raise NotImplementedError(f"a block that counts from the end, {kind}; a kernel takes its row first")
             return None
