@@ -165,7 +165,7 @@ def test_a_removed_variable_is_let_go_of(bus: Bus, viewer: Bus) -> None:
     from factorbus.client import Changes
 
     with bus.map("removed") as whole, viewer.map("removed", interest=Interest("x", period_ms=10)) as part:
-        drive(whole, 0, 6)
+        part.estimate.wait_for(drive(whole, 0, 6))  # the mirror has x5, which is to leave it
         gone: list[Delta] = []
         part.estimate.on_delta(gone.append)
         revision = whole.change(Changes().remove_variables("x5")).revision
