@@ -273,7 +273,7 @@ def test_a_double_click_is_one_edit_and_what_another_took_out_is_no_longer_selec
             page.page.get_by_role("button", name="reject", exact=True).dblclick()
             page.headed("Done")
             assert "rejected between_se2 (x2, x10)" in page.notice("χ²")
-            assert page.page.locator("#edits li:not(.undone)").count() >= 1
+            page.page.locator("#edits li:not(.undone)").first.wait_for()
             page.press("undo 1: rejected between_se2 (x2, x10), by local")
             page.headed("Undone")
             page.click_between("x2", "x10")

@@ -7,6 +7,7 @@ const SHOWN = 12; // edits of the list
 const SILENT = ["unavailable", "internal"]; // nobody has said that it was refused
 const GONE = ["unknown_factor", "unknown_variable"]; // somebody else was faster
 let underWay = false;
+let asks = 0; // of the list of edits: an answer that is overtaken by a later one is not shown
 
 export function notice(text, code = "") {
   of("notice").textContent = code ? `${text} [${code}]` : text;
@@ -74,14 +75,15 @@ const short = (number) => (typeof number === "number" ? Number(number.toPrecisio
 
 export async function loadEdits() {
   const { name } = app.map;
+  const number = ++asks;
   let found;
   try {
     found = await ask(`${mapPath(name)}/edits`);
   } catch (error) {
-    of("edits").replaceChildren(element("p", error.message));
+    if (number === asks) of("edits").replaceChildren(element("p", error.message));
     return;
   }
-  if (app.map.name !== name) return;
+  if (app.map.name !== name || number !== asks) return;
   const { edits, undo, rejected } = found;
   of("undo").disabled = !undo;
   of("undo").textContent = undo ? `undo ${undo.number}: ${undo.what}, by ${undo.who}` : "nothing to undo";
