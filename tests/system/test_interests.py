@@ -283,3 +283,30 @@ def test_a_stranger_with_numbers_of_its_own_gets_all_and_harms_nobody(endpoint: 
                 assert len(answer["variables"][0]["keys"]) == 4 * 8
         finally:
             link.close()
+
+
+def test_a_mirror_follows_on_after_its_service_was_killed(tmp_path: Path) -> None:
+    interest = Interest(letters="x", kinds="se2", box=(-1.0, -1.0, 12.0, 5.0), period_ms=20)
+    with processes(tmp_path) as start:
+        serve = ["-m", "factorbus.service", "--journal", str(tmp_path / "journal"), "--listen"]
+        service = start(*serve, "tcp/127.0.0.1:0")
+        (endpoint,) = service.ready()
+        with (
+            connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus,
+            connect(endpoint, client="looking", timeout_s=PATIENCE_S) as looking,
+            bus.map("killed") as whole,
+            looking.map("killed", interest=interest) as part,
+        ):
+            for begun in (0, 20):
+                part.estimate.wait_for(drive(whole, begun, 20))
+                service.signal(signal.SIGKILL)
+                service.wait()
+                service = start(*serve, endpoint)
+                service.ready()
+            close_loop(whole, "x39", "x8")
+            whole.wait_converged()
+            part.estimate.wait_for(whole.estimate.revision)
+            assert 0 < len(part.estimate) < 40
+            assert held(part.estimate.snapshot().variables()) == held(
+                filter_of(interest).pick(whole.estimate.snapshot().variables())
+            )

@@ -30,7 +30,8 @@ _LETTER_BITS = 56
 class Interest:
     """Which variables, and how fast.  What is empty, or 0, filters and bounds nothing.
 
-    letters: of keys, as "xl" or ("x", "l"); "" is that of keys without a letter.  kinds: of variables, such as "se2".
+    letters: of keys, as "xl" or ("x", "l"); "" is that of keys without a letter.
+    kinds: of variables, as "se2" or ("se2", "point2").
     box: the corners with the lowest and the highest coordinates, metres: x y, x y or x y z, x y z.  A variable is in it
     by its position; one that has none (a rotation, a vector) is in no box.
     period_ms: changes are merged for so long.  bytes_per_s: what the channel carries at most, 0: not bounded.
@@ -98,7 +99,9 @@ def channel_of(interest: Interest) -> str:
 
 
 def _filter_parts(interest: Interest, where: str) -> tuple[tuple[str, ...], tuple[str, ...], tuple[float, ...]]:
-    letters, kinds = _words(interest.letters, f"{where}.letters"), _words(interest.kinds, f"{where}.kinds")
+    letters = _words(interest.letters, f"{where}.letters")
+    given = interest.kinds
+    kinds = _words([given] if given and isinstance(given, str) else given, f"{where}.kinds")
     for letter in letters:
         if len(letter) > 1 or (letter and not (letter.isascii() and letter.isalpha())):
             raise BadOption(f"{where}.letters", f"has {letter[:40]!r}", 'ASCII letters, and "" for keys without one')
