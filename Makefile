@@ -12,7 +12,7 @@ READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help pictures docs setup demo live test test-data test-kernels plain-kernels checked-kernels stock-kernels test-faults lint check crash bench wheel clean
+.PHONY: help pictures docs setup demo live test test-data test-kernels plain-kernels checked-kernels stock-kernels test-faults lint check crash bench wheel release clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -104,6 +104,9 @@ pictures: $(READY_DEV) ## draw the pictures of the README and the site again
 
 wheel: $(READY_DEV) ## build the wheel and try it in a clean virtual environment
 	@bash deploy/setup/try-wheel.sh $(BIN)/python
+
+release: $(READY_DEV) ## build and check what is uploaded, into dist; ARGS=--rehearse: of any commit, without a tag
+	@bash deploy/release/release.sh $(BIN)/python dist $(ARGS)
 
 clean: ## remove what is built, not .venv
 	rm -rf dist build out .pytest_cache .ruff_cache .hypothesis .import_linter_cache
