@@ -1,7 +1,7 @@
 """What the package's page shows: links, and README with links that lead somewhere from there.
 
-FACTORBUS_URL is the address of the project, as https://github.com/OWNER/factorbus.  Without it there are no links of the
-project, and README's stay relative: for an installation from a clone that does not matter.
+FACTORBUS_URL is the address of the project, as https://github.com/OWNER/factorbus.  Without it there are no links of
+the project, and those of README stay relative: for an installation from a clone that does not matter.
 """
 
 import os
