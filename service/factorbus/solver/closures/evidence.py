@@ -48,14 +48,14 @@ class FalseSpread(NamedTuple):
     radians: float
 
 
-class Judged(NamedTuple):
+class Evidence(NamedTuple):
     """d² (n, ...) and the chance of false ones to be within the quantile."""
 
     distance: F64
     chance: F64
 
 
-def judge_each(c: ClosureNumbers, quantile: float, spreads: Sequence[FalseSpread]) -> Judged:
+def judge_each(c: ClosureNumbers, quantile: float, spreads: Sequence[FalseSpread]) -> Evidence:
     """Each by itself against the map; the chances are of `spreads`, one after the other, (n, spreads)."""
     n, d = c.noise.shape[:2]
     there = inverse_motion(c.a) @ c.b
@@ -63,10 +63,10 @@ def judge_each(c: ClosureNumbers, quantile: float, spreads: Sequence[FalseSpread
     J = np.concatenate([-adjoint_motion(inverse_motion(there)), np.broadcast_to(np.eye(d), (n, d, d))], axis=-1)
     blocks = c.known.reshape(n, 2 * d, n, 2 * d)[np.arange(n), :, np.arange(n)]
     S = c.noise + _bent(J @ blocks @ J.swapaxes(1, 2))
-    return Judged(_squared(r, S), _chances(S, quantile, spreads))
+    return Evidence(_squared(r, S), _chances(S, quantile, spreads))
 
 
-def judge_pairs(c: ClosureNumbers, i: I64, j: I64, quantile: float, spreads: Sequence[FalseSpread]) -> Judged:
+def judge_pairs(c: ClosureNumbers, i: I64, j: I64, quantile: float, spreads: Sequence[FalseSpread]) -> Evidence:
     """Closures i[k] and j[k] against each other."""
     d = c.noise.shape[1]
     to_i, a_ij, b_ji = inverse_motion(c.z[i]), inverse_motion(c.a[i]) @ c.a[j], inverse_motion(c.b[j]) @ c.b[i]
@@ -78,7 +78,7 @@ def judge_pairs(c: ClosureNumbers, i: I64, j: I64, quantile: float, spreads: Seq
     rows = [np.concatenate([blocks[p, :, q] for q in (i, j)], axis=-1) for p in (i, j)]
     S = c.noise[i] + back @ c.noise[j] @ back.swapaxes(1, 2)
     S += _bent(J @ np.concatenate(rows, axis=-2) @ J.swapaxes(1, 2))
-    return Judged(_squared(tangent_of(loop), S), _chances(S, quantile, spreads))
+    return Evidence(_squared(tangent_of(loop), S), _chances(S, quantile, spreads))
 
 
 def judge_accepted(c: ClosureNumbers) -> F64:
