@@ -62,7 +62,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     aligning   two maps into one frame, of candidates of which most are false: how often right, wrong, left open;
                --draws, --only
     closures   false loop closures, online: streets with shares of false ones (random, local, grouped), tested as they
-               come, beside the same solver without a test and with Huber, Cauchy and DCS losses; a quarter of an hour
+               come, beside the same solver without a test and with Huber, Cauchy and DCS losses; half an hour
                without the others, hours with; --draws, --only, --shares, --rivals
     inertial   drives with an IMU and GNSS that ship in the gtsam wheel, online, beside iSAM2 with the same factors;
                --only, --every
