@@ -17,6 +17,7 @@ ASKED = (
     "aligning",
     "ask",
     "batch",
+    "closures",
     "digest",
     "calibration",
     "inertial",
@@ -60,6 +61,9 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
                units of its covariance; --seeds, --only
     aligning   two maps into one frame, of candidates of which most are false: how often right, wrong, left open;
                --draws, --only
+    closures   false loop closures, online: streets with shares of false ones (random, local, grouped), tested as they
+               come, beside the same solver without a test and with Huber, Cauchy and DCS losses; half an hour
+               without the others, hours with; --draws, --only, --shares, --rivals
     inertial   drives with an IMU and GNSS that ship in the gtsam wheel, online, beside iSAM2 with the same factors;
                --only, --every
     ranges     range-only drives that ship in the gtsam wheel, online, beside iSAM2 with the same factors: χ² of

@@ -1,0 +1,162 @@
+"""Which of some closures are believed: each by itself, or several that agree.
+
+    passed       within the gate, where a false one would hardly be
+    agrees       one of a set that agrees, as false ones do not by chance (below)
+    unsure       within the gate, and so would many a false one be
+    improbable   outside the gate
+
+A set is the largest of which each two agree.  Chance is excluded twice.  Among n independent false closures, off by up
+to the policy's spread, C(n, m) Π p sets like it are expected: p for one to agree with one before it, over the tree of
+the least likely agreements.  And mistakes bring several closures with them, as two corridors that look alike do, and
+lead anywhere in the map: of n places C(n, m) q Π p agree, q for the first to be within the map's gate.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.solver.closures.evidence import ClosureNumbers, FalseSpread, judge_each, judge_pairs
+from factorbus.solver.closures.policy import ClosurePolicy
+from factorbus.solver.covariance.gates import threshold
+from factorbus.solver.kernels.jit.compile import F64, I64
+
+PASSED, AGREES, UNSURE, IMPROBABLE = "passed", "agrees", "unsure", "improbable"
+_LEAST_CHANCE = 1e-12
+_MOST_BRANCHES = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """What each of n closures is: one of the reasons above; d², and the chance of a false one to be within the gate.
+
+    rivals: those outside the gate that agree with each other, at two places or more: the map may be wrong.
+    """
+
+    reasons: list[str]
+    distance: F64
+    chance: F64
+    rivals: list[int]
+
+
+def choose_closures(c: ClosureNumbers, extent_m: float, policy: ClosurePolicy) -> Chosen:
+    """Judge `c`; extent_m: half the length of the map, where mistakes may lead."""
+    d = c.noise.shape[1]
+    probabilities = policy.closure_gate_probability, policy.closure_out_probability, policy.closure_set_probability
+    gate, out, nearest = (float(threshold(np.array([d]), p)[0]) for p in probabilities)
+    own = FalseSpread(policy.closure_spread_m, policy.closure_spread_rad)
+    spreads = (own, FalseSpread(max(extent_m, own.metres), math.pi))
+    each = judge_each(c, gate, spreads)
+    within = each.distance <= gate
+    sure = within & (each.chance[:, 0] <= policy.closure_chance_max)
+    reasons = [PASSED if s else UNSURE if w else IMPROBABLE for s, w in zip(sure, within, strict=True)]
+    sets = _Sets(c, gate, spreads, policy)
+    members = sets.believed(np.flatnonzero(~sure & (each.distance <= out)), each.chance[:, 1])
+    if members and each.distance[members].min() <= nearest:
+        for k in members:
+            reasons[k] = AGREES
+    return Chosen(reasons, each.distance, each.chance[:, 0], sets.rivals(np.flatnonzero(~within)))
+
+
+class _Sets:
+    """Sets of closures that agree.
+
+    agree (n, n), chance (n, n, spreads): of each two.  places (n,): a number for each two places closures are between.
+    """
+
+    def __init__(self, c: ClosureNumbers, gate: float, spreads: Sequence[FalseSpread], policy: ClosurePolicy) -> None:
+        n = len(c.z)
+        i, j = np.triu_indices(n, 1)
+        pairs = judge_pairs(c, i, j, gate, spreads)
+        self.agree, self.chance = np.zeros((n, n), bool), np.ones((n, n, len(spreads)))
+        self.agree[i, j] = self.agree[j, i] = pairs.distance <= gate
+        self.chance[i, j] = self.chance[j, i] = pairs.chance
+        self.places, self.policy = closure_places(c, policy.closure_place_m), policy
+
+    def believed(self, among: I64, alone: F64) -> list[int]:
+        """The largest one among some, or none where it may be chance; alone (n,): the chance of each, anywhere.
+
+        Of each member one other says so well where it is that a false one would hardly agree.
+        """
+        members = self._largest(among)
+        while members.size > 1:
+            sure = self.chance[np.ix_(members, members)][..., 0].min(axis=1) <= self.policy.closure_chance_max
+            if sure.all():
+                break
+            members = members[sure]
+        if members.size < 2:
+            return []
+        chance, own = self.chance[np.ix_(members, members)], self.places[members]
+        there = np.unique(own)
+        # Of two places the two that are the least likely to agree.
+        between = np.array([[chance[own == p][:, own == q, 1].min() for q in there] for p in there])
+        logarithm = _chain(between) + math.log(max(float(alone[members].min()), _LEAST_CHANCE))
+        by_mistake = _expected(np.unique(self.places[among]).size, there.size, logarithm)
+        is_sure = self._is_set(members, among.size) and by_mistake <= self.policy.closure_chance_max
+        return members.tolist() if is_sure else []
+
+    def rivals(self, among: I64) -> list[int]:
+        """The largest one among some, of two places or more, that is not by chance of independent ones."""
+        members = self._largest(among)
+        if members.size < 3 or np.unique(self.places[members]).size < 2:
+            return []
+        return members.tolist() if self._is_set(members, among.size) else []
+
+    def _is_set(self, members: I64, count: int) -> bool:
+        """Whether independent false ones, of as many, would hardly agree so."""
+        logarithm = _chain(self.chance[np.ix_(members, members)][..., 0])
+        return _expected(count, members.size, logarithm) <= self.policy.closure_sets_max
+
+    def _largest(self, among: I64) -> I64:
+        return among[largest_agreeing(self.agree[np.ix_(among, among)])]
+
+
+def largest_agreeing(agree: np.ndarray) -> I64:
+    """The members, ascending, of a largest set of which each agrees with each other one; agree (n, n), symmetric.
+
+    Branch and bound, for a few dozens.  Of several equal ones the same at every call.
+    """
+    n = len(agree)
+    order = sorted(range(n), key=lambda v: (-int(agree[v].sum()), v))
+    near = {v: {u for u in order if agree[v, u] and u != v} for v in order}
+    best: list[int] = []
+    stack = [([], order)]
+    for _ in range(_MOST_BRANCHES):
+        if not stack:
+            break
+        members, left = stack.pop()
+        if len(members) > len(best):
+            best = members
+        if left and len(members) + len(left) > len(best):
+            first, rest = left[0], left[1:]
+            stack.append((members, rest))
+            stack.append(([*members, first], [u for u in rest if u in near[first]]))
+    return np.array(sorted(best), np.int64)
+
+
+def closure_places(c: ClosureNumbers, within_m: float) -> I64:
+    """(n,): the first of those before it, or itself, that is between the same two places; it is none of another's."""
+    a, b = (np.linalg.norm(T[:, None, :-1, -1] - T[None, :, :-1, -1], axis=-1) <= within_m for T in (c.a, c.b))
+    same, number = a & b, np.arange(len(c.a))
+    for k in range(len(number)):
+        first = np.flatnonzero(same[k, : k + 1] & (number[: k + 1] == np.arange(k + 1)))
+        number[k] = first[0]
+    return number
+
+
+def _chain(chance: F64) -> float:
+    """Σ ln p over the tree that joins all of n by the least likely agreements; chance (n, n)."""
+    logarithm = np.log(np.maximum(chance, _LEAST_CHANCE))
+    nearest, total = logarithm[0].copy(), 0.0
+    nearest[0] = np.inf
+    for _ in range(1, len(chance)):
+        k = int(nearest.argmin())
+        total += float(nearest[k])
+        nearest = np.where(np.isinf(nearest), np.inf, np.minimum(nearest, logarithm[k]))
+        nearest[k] = np.inf
+    return total
+
+
+def _expected(n: int, m: int, logarithm: float) -> float:
+    return math.exp(min(math.log(math.comb(n, m)) + logarithm, 0.0))
