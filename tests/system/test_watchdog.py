@@ -30,7 +30,10 @@ STUCK_S = 3.0  # longer than a thread that is well waits for a core
 
 
 class Manager:
-    """The service manager's end of NOTIFY_SOCKET.  It reads whatever a test does: who notifies waits while it is full."""
+    """The service manager's end of NOTIFY_SOCKET.
+
+    It reads while a test does other things, as a real one does: who sends waits while the socket is full.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
