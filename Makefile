@@ -34,12 +34,12 @@ demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as
 live: $(READY) ## a graph file of yours, FILE=my.g2o, as a live map in the browser
 	@$(BIN)/factorbus replay $(FILE) --live $(ARGS)
 
-# Side by side, the tests of one file in one process, which share what it has started; then, one by one, those that want
+# Side by side, the tests of one file in one process, which share what it has started, the longest files first; then, one by one, those that want
 # the machine to themselves.  `tests/test_side_by_side.py` holds that each runs in one of the two.
 test: $(READY_DEV) ## the tests
 	@$(BIN)/factorbus warm
 ifeq ($(strip $(ARGS)),)
-	$(BIN)/python -m pytest -m "not data and not alone" -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -m "not data and not alone" -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 	$(BIN)/python -m pytest -m "not data and alone"
 else
 	$(BIN)/python -m pytest -m "not data" $(ARGS)

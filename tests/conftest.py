@@ -1,4 +1,5 @@
-"""What all tests share: where the public data sets are, how hypothesis behaves, a process that stays as it was."""
+"""What all tests share: their order, where the public data sets are, how hypothesis behaves, a process that stays as it
+was."""
 
 import os
 import signal
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from longest import rank
 from process_state import as_it_was
 
 # Read when NumPy is loaded, here and in every process that a test starts.  By its own way a library of linear algebra
@@ -27,6 +29,11 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 settings.load_profile("factorbus")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first; all else, and the tests of a file, in their order."""
+    items.sort(key=lambda item: rank(item.path))
 
 
 @pytest.fixture(autouse=True)

@@ -6,6 +6,8 @@ import shlex
 import subprocess
 from pathlib import Path
 
+from longest import FILES, rank
+
 ROOT = Path(__file__).resolve().parents[1]
 SIDE_BY_SIDE, ALONE = "not data and not alone", "not data and alone"
 
@@ -25,8 +27,16 @@ def planned(**variables: str) -> list[list[str]]:
 def test_every_test_but_the_long_ones_runs_in_one_of_two_parts() -> None:
     """The two are each other's opposite, and neither leaves out or names a file."""
     beside, alone = planned()
-    assert beside == ["-m", SIDE_BY_SIDE, "-n", "auto", "--maxprocesses", "4", "--dist", "loadfile"]
+    how = "-n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder"
+    assert beside == ["-m", SIDE_BY_SIDE, *how.split()]
     assert alone == ["-m", ALONE]
+
+
+def test_the_longest_files_begin_first() -> None:
+    """By itself the plugin begins with those of the most tests, and ends with one test of a minute."""
+    files = [path.relative_to(ROOT) for path in (ROOT / "tests").rglob("test_*.py")]
+    begun = sorted((path for path in files if rank(path) < len(FILES)), key=rank)
+    assert [path.relative_to("tests").as_posix() for path in begun] == list(FILES)
 
 
 def test_what_is_asked_for_is_run_one_by_one() -> None:

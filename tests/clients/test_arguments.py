@@ -20,8 +20,6 @@ from factorbus.proto.messages import Accepted, Batch, Estimate, MapGraph
 from factorbus.proto.problems import BadLoss, BadOption, BadShape, ClosedHere, Problem
 from factorbus.proto.symbols import symbol
 
-pytestmark = pytest.mark.timeout(60)
-
 ANY: Any = "no"  # a str, whatever the signature says
 POINT = Draft().point2("l1", (1, 0))
 

@@ -200,7 +200,7 @@ def test_asyncio_waits_no_longer_than_it_is_told() -> None:
 def test_a_killed_service_comes_back_empty_and_the_client_says_so(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/bus.sock"
     service = Service(endpoint)
-    with connect(endpoint, timeout_s=30) as bus, bus.map("kitchen") as kitchen:
+    with connect(endpoint, timeout_s=60) as bus, bus.map("kitchen") as kitchen:
         kitchen.insert(start())
         first = kitchen.epoch
         service.kill()
@@ -213,7 +213,7 @@ def test_a_killed_service_comes_back_empty_and_the_client_says_so(tmp_path: Path
         with pytest.raises(Refused) as caught:
             pending_insert.result()
         assert caught.value.code in ("unknown_map", "wrong_epoch")
-        with connect(endpoint, timeout_s=30) as other, other.map("kitchen") as anew:
+        with connect(endpoint, timeout_s=60) as other, other.map("kitchen") as anew:
             anew.insert(start())
             with suppress(Refused):
                 kitchen.insert(step(1))

@@ -17,7 +17,6 @@ from factorbus.proto.camera import Camera
 from factorbus.proto.problems import NotSupported, OtherProtocol, Unavailable
 from factorbus.proto.protocol import known
 
-pytestmark = pytest.mark.timeout(60)
 CAMERA = Camera("pinhole", (400.0, 400.0, 320.0, 240.0))
 
 
@@ -68,7 +67,7 @@ def test_silence_of_nobody_is_silence(tmp_path: Path, ask: str) -> None:
 def test_who_has_been_heard_of_is_waited_for(tmp_path: Path) -> None:
     """At a router one service may be away for a moment while another, newer one is there."""
     service = Service(tmp_path)
-    with connect(endpoint_in(tmp_path), timeout_s=20) as bus:
+    with connect(endpoint_in(tmp_path), timeout_s=60) as bus:
         kitchen = bus.map(MAP)
         kitchen.insert(Draft().point2("l1", (1.0, 2.0)))
         service.close()

@@ -10,8 +10,6 @@ from faulty.service import MAP, Service, endpoint_in, not_a_number
 
 from factorbus.client import Draft, Map, NotConverged, Refused, Unavailable, aio, connect
 
-pytestmark = pytest.mark.timeout(60)
-
 # What reports and stats say: not there yet; there to a thousandth, and on the way to the optimum; at it.
 CONVERGING = {"converged": False, "converging": True}
 POLISHED = {"converged": True, "converging": True}

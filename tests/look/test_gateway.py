@@ -16,6 +16,7 @@ from turned import closing, in_one
 
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import OK, UNAVAILABLE, USAGE
+from factorbus.cli.process import bus as way_to_bus
 from factorbus.client import Draft, connect
 from factorbus.proto.messages import Delta, Variables
 from factorbus.proto.stamps import NO_STAMP
@@ -52,7 +53,7 @@ def refusal(address: str, **headers: str) -> tuple[int, str]:
 
 
 def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None:
-    with connect(endpoint, client="robot") as bus, bus.map("asked") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("asked") as joined:
         for n, step in enumerate(city_trees(poses=80, seed=3)):
             pose, *others = step.batch.variables
             joined.insert(step.batch._replace(variables=(pose._replace(stamps=np.array([T0 + n])), *others)))
@@ -119,7 +120,7 @@ def test_a_contradiction_is_named(endpoint: str, gateway: str) -> None:
     for i in range(4):
         draft.se2(f"x{i + 1}").between_se2(f"x{i}", f"x{i + 1}", (1.0, 0, 0), sigmas=(0.1, 0.1, 0.05))
     draft.between_se2("x0", "x4", (2.0, 0, 0), sigmas=(0.3, 0.3, 0.1))
-    with connect(endpoint, client="robot") as bus, bus.map("wrong") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("wrong") as joined:
         joined.insert(draft, settle=True)
         joined_chi2 = joined.chi2().chi2
     said = get(f"{gateway}/api/maps/wrong/variables/x4")
@@ -133,7 +134,7 @@ def test_a_contradiction_is_named(endpoint: str, gateway: str) -> None:
 
 
 def test_problems_have_their_codes(endpoint: str, gateway: str) -> None:
-    with connect(endpoint, client="robot") as bus, bus.map("small") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("small") as joined:
         joined.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
     root = f"{gateway}/api/maps"
     assert refusal(f"{root}/nowhere/estimate") == (404, "unknown_map")
@@ -153,7 +154,10 @@ def test_problems_have_their_codes(endpoint: str, gateway: str) -> None:
 
 
 @pytest.mark.parametrize("command", [["gateway"], ["watch", "town", "--serve"]])
-def test_other_machines_are_served_only_if_one_says_so(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_machines_are_served_only_if_one_says_so(
+    command: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(way_to_bus, "_LISTENING_S", 0.0)  # that nobody is there is said at the first refusal
     for host in ("0.0.0.0", "::", "192.168.1.20", "robot.local"):
         assert main([*command, "--connect", "tcp/127.0.0.1:1", "--host", host]) == USAGE
         assert "[exposed]" in capsys.readouterr().err
@@ -166,15 +170,15 @@ def test_a_page_from_elsewhere_gets_no_map(endpoint: str, gateway: str) -> None:
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect as dial
 
-    with connect(endpoint, client="robot") as bus, bus.map("guarded") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("guarded") as joined:
         joined.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
     live = f"{gateway.replace('http', 'ws')}/api/maps/guarded/live"
     with dial(live, origin="http://evil.example") as socket, pytest.raises(ConnectionClosed) as closed:  # type: ignore[arg-type]
-        socket.recv(timeout=30)
+        socket.recv(timeout=60)
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == 4403
     with dial(live) as socket:
-        assert json.loads(socket.recv(timeout=30))["variables"][0]["keys"] == ["x0"]
+        assert json.loads(socket.recv(timeout=60))["variables"][0]["keys"] == ["x0"]
 
 
 def test_a_slow_browser_misses_no_value(endpoint: str, gateway: str) -> None:
@@ -182,7 +186,7 @@ def test_a_slow_browser_misses_no_value(endpoint: str, gateway: str) -> None:
     from websockets.sync.client import connect as dial
 
     steps = list(manhattan(poses=150, seed=4))
-    with connect(endpoint, client="robot") as bus, bus.map("streamed") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("streamed") as joined:
         for step in steps[:30]:
             joined.insert(step.batch)
         with dial(f"{gateway.replace('http', 'ws')}/api/maps/streamed/live", max_size=None) as socket:
@@ -190,7 +194,7 @@ def test_a_slow_browser_misses_no_value(endpoint: str, gateway: str) -> None:
                 joined.insert(step.batch)
             values, revision = {}, 0
             while revision < joined.estimate.revision:
-                message = json.loads(socket.recv(timeout=30))
+                message = json.loads(socket.recv(timeout=60))
                 assert message["type"] == "estimate" or message["previous"] == revision
                 revision = message["revision"]
                 for group in message["variables"]:
@@ -203,7 +207,7 @@ def test_a_slow_browser_misses_no_value(endpoint: str, gateway: str) -> None:
 def test_the_page_in_a_browser(endpoint: str, gateway: str, tmp_path: Path) -> None:
     """It loads, poses move, and a variable that is clicked is explained."""
     steps = list(city_trees(poses=120, seed=2))
-    with connect(endpoint, client="robot") as bus, bus.map("town") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("town") as joined:
         for step in steps[:60]:
             joined.insert(step.batch)
         with page_of(f"{gateway}/#town") as page:
@@ -254,7 +258,7 @@ def _said_converging(endpoint: str, gateway: str, name: str) -> bool:
     with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map(name, "all-batch") as joined:
         joined.insert(in_one(poses, 90.0))
         with page_of(f"{gateway}/#{name}") as page:
-            page.wait_for_function(f"window.factorbus.revision === {joined.estimate.revision}", timeout=60_000)
+            page.wait_for_function(f"window.factorbus.revision >= {joined.estimate.revision}", timeout=60_000)
             said = "document.getElementById('state').textContent"
             page.evaluate(
                 f"window.seen = []; new MutationObserver(() => window.seen.push({said}))"
@@ -279,8 +283,8 @@ def test_a_file_of_ones_own_is_seen_live_by_one_command(spawn: Callable[..., Pro
     address = process.said("the map, live: ")
     with page_of(address) as page:
         page.wait_for_function("window.factorbus.revision > 5", timeout=60_000)
-        page.wait_for_function("window.factorbus.revision === 81", timeout=60_000)
-        assert page.evaluate("window.factorbus.placeOf('x79')") is not None
+        # By its last pose: a drive that pauses, for a machine that is busy, has further steps in between.
+        page.wait_for_function("window.factorbus.placeOf('x79')", timeout=60_000)
         process.said("the page stays until Ctrl-C")
     process.signal(signal.SIGINT)
     assert process.wait() == OK
@@ -297,7 +301,7 @@ def test_it_stops_with_browsers_connected_and_says_when_a_port_is_taken(
 ) -> None:
     from websockets.sync.client import connect as dial
 
-    with connect(endpoint, client="robot") as bus, bus.map("left") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("left") as joined:
         joined.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
         port = str(free_port())
         process = spawn("-m", "factorbus.cli", "gateway", "--connect", endpoint, "--port", port)
@@ -305,6 +309,6 @@ def test_it_stops_with_browsers_connected_and_says_when_a_port_is_taken(
         assert main(["gateway", "--connect", endpoint, "--port", port]) == USAGE
         assert "[port_taken]" in capsys.readouterr().err
         with dial(f"{address.replace('http', 'ws')}/api/maps/left/live") as socket:
-            socket.recv(timeout=30)
+            socket.recv(timeout=60)
             process.signal(signal.SIGTERM)
             assert process.wait() == OK

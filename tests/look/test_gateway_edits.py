@@ -151,6 +151,7 @@ def test_a_merge_that_cannot_be_says_why(bus: Bus, gateway: str, change: dict[st
         if not hall.estimate.revision:
             hall.insert(square())
             attic.insert(square().point2("l0", (1, 1)).prior_point2("l0", (1, 1), sigmas=(1, 1)))
+        hall.wait_converged()  # no further step of its own is counted
         asked = {"other": "attic", "pairs": [["x0", "x4"]], "sigmas": [0.1, 0.1, 0.05], "absolute": "leave_out"}
         revision = hall.stats()["revision"]
         problem = refused(lambda: Editor(gateway, "hall").edit("merge", **(asked | change)))
@@ -163,6 +164,7 @@ def test_what_the_service_refuses_comes_in_its_words_and_changes_nothing(bus: Bu
     with bus.map("chain") as joined:
         chain = Draft().se2("x0", (0, 0, 0), fixed=True).se2("x1")
         joined.insert(chain.between_se2("x0", "x1", (1, 0, 0), sigmas=(0.1, 0.1, 0.1)))
+        joined.wait_converged()
         revision = joined.stats()["revision"]
         only = editor.factor_between("x0", "x1")
         problem = refused(lambda: editor.edit("reject", factors=[only]))

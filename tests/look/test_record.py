@@ -65,7 +65,7 @@ def test_a_recording_has_every_estimate_and_every_factor(
     steps = list(city_trees(poses=120, seed=5))
     timed = [step.batch._replace(variables=tuple(stamped(group, n) for group in step.batch.variables))
              for n, step in enumerate(steps)]  # fmt: skip
-    with connect(endpoint, client="robot") as bus, bus.map("taped") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("taped") as joined:
         for batch in timed[:40]:
             joined.insert(batch)
         path = tmp_path / "tape.mcap"

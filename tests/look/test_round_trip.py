@@ -14,7 +14,7 @@ from factorbus.simulate import city_trees, sphere
 
 @pytest.mark.parametrize("world", [city_trees, sphere])
 def test_over_the_bus_values_factors_and_chi2_survive(world, endpoint: str, tmp_path: Path) -> None:
-    with connect(endpoint, client="robot") as bus:
+    with connect(endpoint, client="robot", timeout_s=60) as bus:
         with bus.map(f"out-{world.__name__}") as first:
             first.insert(merged(step.batch for step in world(poses=150, seed=6)), settle=True)
             path = tmp_path / "map.g2o"

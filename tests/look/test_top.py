@@ -53,7 +53,7 @@ class Terminal:
     def close(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
-            self.process.wait(30)
+            self.process.wait(60)
         os.close(self._ours)
 
 
@@ -75,7 +75,7 @@ def test_the_screen_follows_the_service(spawn: Callable[..., Process]) -> None:
     (endpoint,) = spawn("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()
     worker = spawn("-m", "factorbus.cli", "work", "--connect", endpoint, "--name", "worker7", "--no-warm")
     worker.ready()
-    with connect(endpoint, client="robot") as bus, bus.map("topped") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("topped") as joined:
         steps = list(manhattan(poses=60, seed=3))
         for step in steps[:20]:
             joined.insert(step.batch)
@@ -97,7 +97,7 @@ def test_the_screen_follows_the_service(spawn: Callable[..., Process]) -> None:
             assert row[:5] == ["topped", stats["mode"], "60", str(stats["factors"]), "60"]
             assert f"{stats['chi2']:.6g}" in row
             os.killpg(screen.process.pid, signal.SIGINT)
-            assert screen.process.wait(30) == 0
+            assert screen.process.wait(60) == 0
 
 
 def test_a_service_that_goes_is_said_and_found_again(tmp_path) -> None:
@@ -114,9 +114,9 @@ def test_a_service_that_goes_is_said_and_found_again(tmp_path) -> None:
 
 
 def test_who_has_left_is_no_longer_listed(endpoint: str) -> None:
-    with connect(endpoint, client="stayer") as staying, staying.map("departed") as stayed:
+    with connect(endpoint, client="stayer", timeout_s=60) as staying, staying.map("departed") as stayed:
         stayed.insert(Draft().point2("l1", (1.0, 2.0)).prior_point2("l1", (1.0, 2.0), sigmas=(1.0, 1.0)))
-        with connect(endpoint, client="leaver") as bus, bus.map("departed") as joined:
+        with connect(endpoint, client="leaver", timeout_s=60) as bus, bus.map("departed") as joined:
             joined.insert(Draft().point2("l2", (1.0, 2.0)).prior_point2("l2", (1.0, 2.0), sigmas=(1.0, 1.0)))
             joined.insert(Draft().point2("l3", (1.0, 2.0)).prior_point2("l3", (1.0, 2.0), sigmas=(1.0, 1.0)))
             assert stayed.clients() >= {stayed.client, joined.client}
@@ -148,7 +148,7 @@ def test_where_there_is_no_terminal_it_says_what_to_take_instead(endpoint: str) 
 
 
 def test_once_as_a_document(endpoint: str) -> None:
-    with connect(endpoint, client="robot") as bus, bus.map("documented") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("documented") as joined:
         for step in manhattan(poses=10, seed=3):
             joined.insert(step.batch)
         ran = subprocess.run(

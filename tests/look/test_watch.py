@@ -43,7 +43,7 @@ def test_a_part_of_a_map_is_watched_without_the_rest(
     endpoint: str, spawn: Callable[..., Process], tmp_path: Path
 ) -> None:
     path, box = tmp_path / "part.rrd", "--box=-4,-4,4,4"
-    with connect(endpoint, client="robot") as bus, bus.map("partly") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("partly") as joined:
         for step in city_trees(poses=60, seed=2):
             joined.insert(step.batch)
         joined.wait_converged(60)
@@ -82,7 +82,7 @@ def test_the_recording_has_every_step_and_the_map_at_the_end(
 ) -> None:
     steps = list(city_trees(poses=200, seed=2))
     path = tmp_path / "town.rrd"
-    with connect(endpoint, client="robot") as bus, bus.map("watched") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("watched") as joined:
         for step in steps[:50]:
             joined.insert(step.batch)
         watcher = spawn("-m", "factorbus.cli", "watch", "watched", "--connect", endpoint, "--save", str(path))
@@ -128,7 +128,7 @@ def test_the_log_says_while_a_map_is_converging(endpoint: str, spawn: Callable[.
 @needs_browser
 def test_a_browser_shows_the_served_view(endpoint: str, spawn: Callable[..., Process], tmp_path: Path) -> None:
     ports = ["--web-port", str(free_port()), "--data-port", str(free_port())]
-    with connect(endpoint, client="robot") as bus, bus.map("served") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("served") as joined:
         for step in manhattan(poses=150, seed=2):
             joined.insert(step.batch)
         watcher = spawn("-m", "factorbus.cli", "watch", "served", "--connect", endpoint, "--serve", *ports)
@@ -162,7 +162,7 @@ def test_a_map_that_is_yet_to_come_is_waited_for(endpoint: str, spawn: Callable[
     path = tmp_path / "a.rrd"
     watcher = spawn("-m", "factorbus.cli", "watch", "later", "--connect", endpoint, "--save", str(path))
     watcher.said("there is no map 'later' here;")
-    with connect(endpoint, client="robot") as bus, bus.map("later") as joined:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("later") as joined:
         for step in manhattan(poses=5, seed=1):
             joined.insert(step.batch)
         assert watcher.ready() == [str(path)]

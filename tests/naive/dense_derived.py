@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from naive.dense_poses import pose_matrix, pose_vector
+from naive.dense_poses import joined, pose_matrix, pose_vector
 from scipy.linalg import expm
 
 MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset", "focal", "bundler", "intrinsics")
@@ -24,13 +24,13 @@ def is_derived(kind: str) -> bool:
 
 def twist_matrix(v: np.ndarray) -> np.ndarray:
     """The generator of a motion, (3,) in the plane or (6,) in space: velocities, then angular velocities."""
-    n = 2 if len(v) == 3 else 3
-    xi = np.zeros((n + 1, n + 1))
-    xi[:n, n] = v[:n]
+    n = 2 if v.shape[-1] == 3 else 3
+    xi = np.zeros((*v.shape[:-1], n + 1, n + 1))
+    xi[..., :n, n] = v[..., :n]
     if n == 2:
-        xi[0, 1], xi[1, 0] = -v[2], v[2]
+        xi[..., 0, 1], xi[..., 1, 0] = -v[..., 2], v[..., 2]
     else:
-        xi[:3, :3] = np.cross(np.eye(3), v[3:])
+        xi[..., :3, :3] = np.cross(np.eye(3), v[..., None, 3:])
     return xi
 
 
@@ -38,36 +38,39 @@ def base_ends(kind: str, ends: list[np.ndarray], z: np.ndarray) -> tuple[list[np
     """The values that the base kind has its residual at, and what it has measured."""
     _, modifiers = parts_of(kind)
     count = len(ends) - len(modifiers)
-    of, z, width = dict(zip(modifiers, ends[count:], strict=True)), z.copy(), len(ends[0])
-    left, right = np.eye(3 if width == 3 else 4), np.eye(3 if width == 3 else 4)
+    of, width = dict(zip(modifiers, ends[count:], strict=True)), ends[0].shape[-1]
+    n = 2 if width == 3 else 3
+    left = right = np.eye(n + 1)
     if "mount" in of:
         right = pose_matrix(of["mount"])
     if "offset" in of:
-        n = 3 if width == 3 else 6
-        right = expm(twist_matrix(z[-n:]) * of["offset"][0])
-        z = z[:-n]
+        known = 3 if width == 3 else 6
+        right = expm(twist_matrix(z[..., -known:]) * of["offset"][..., None])
+        z = z[..., :-known]
     if "frame" in of:
         left = pose_matrix(of["frame"])
     if "arm" in of:
-        z = np.concatenate([z, of["arm"]])
+        z = joined(z, of["arm"])
     if "scale" in of:
-        z[: len(left) - 1] *= of["scale"][0]
+        z = joined(z[..., :n] * of["scale"], z[..., n:])
     for lens in LENSES:
         if lens in of:
-            z[2:] = with_lens(lens, of[lens], z[2:])
+            z = joined(z[..., :2], with_lens(lens, of[lens], z[..., 2:]))
     if not {"mount", "offset", "frame"} & of.keys():
         return ends[:count], z
-    return [pose_vector(left @ pose_matrix(end) @ right) if len(end) == width else end for end in ends[:count]], z
+    moved = [pose_vector(left @ pose_matrix(x) @ right) if x.shape[-1] == width else x for x in ends[:count]]
+    return moved, z
 
 
 def with_lens(modifier: str, numbers: np.ndarray, lens: np.ndarray) -> np.ndarray:
     """The lens of a measurement, (code, fu, fv, cx, cy, limit, five of the model), with these numbers in it."""
-    code, fu, fv, cx, cy, limit, *more = lens
+    code, fu, fv, centre, limit, more = np.split(lens, [1, 2, 3, 5, 6], axis=-1)
     if modifier == "intrinsics":
-        return np.array([code, *numbers[:4], limit, *numbers[4:]])
+        return joined(code, numbers[..., :4], limit, numbers[..., 4:])
     if modifier == "bundler":
-        more[:2] = numbers[1:]
-    return np.array([code, numbers[0], numbers[0] * fv / fu, cx, cy, limit, *more])
+        more = joined(numbers[..., 1:], more[..., 2:])
+    focal = numbers[..., :1]
+    return joined(code, focal, focal * fv / fu, centre, limit, more)
 
 
 def derived_residual(

@@ -1,4 +1,4 @@
-"""Inverse-depth features with matrices, one at a time, as the papers write them: the twin of the kernels.
+"""Inverse-depth features with matrices, as the papers write them: the twin of the kernels.
 
 Nothing here shares a formula with them: lenses are written forwards only and inverted by a root finder, rotations are
 scipy's, Jacobians are central differences of fourth order, covariances are J P Jᵀ with everything in it.
@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from factorbus.proto.camera import Camera
 
 
-def radial_factor(camera: Camera, mm: np.ndarray) -> float:
-    """D of the two-parameter radial model at a distorted point in mm."""
-    r2 = mm @ mm
+def radial_factor(camera: Camera, r2: float) -> float:
+    """D of the two-parameter radial model at a distorted point whose distance from the centre squared is r2 mm²."""
     return 1 + camera.number("k1") * r2 + camera.number("k2") * r2**2
 
 
@@ -23,43 +22,54 @@ def pixel(camera: Camera, ray: np.ndarray) -> np.ndarray:
     """The distorted pixel of a ray in camera axes."""
     centre = np.array([camera.number("cx"), camera.number("cy")])
     if camera.model == "radial":
-        size = np.array([camera.number("dx"), camera.number("dy")])
-        undistorted = camera.number("f") * ray[:2] / ray[2]
-        radius = np.linalg.norm(undistorted)
-        if radius == 0:
-            return centre
-
-        def beyond(r: float) -> float:
-            return r * radial_factor(camera, np.array([r, 0.0])) - radius
-
-        top = radius
-        while beyond(top) < 0:
-            top *= 1.5
-        distorted = brentq(beyond, 0, top, xtol=1e-16, rtol=1e-15)
-        return centre + undistorted * distorted / radius / size
+        return centre + _radial(camera, ray) / [camera.number("dx"), camera.number("dy")]
     focal = np.array([camera.number("fx"), camera.number("fy")])
     if camera.model == "pinhole":
-        return centre + focal * ray[:2] / ray[2]
+        return centre + focal * ray[..., :2] / ray[..., 2:]
     if camera.model == "radtan":
-        return centre + focal * radtan(camera, ray[:2] / ray[2])
-    angle = np.arctan2(np.linalg.norm(ray[:2]), ray[2])
+        return centre + focal * radtan(camera, ray[..., :2] / ray[..., 2:])
+    beside = np.linalg.norm(ray[..., :2], axis=-1, keepdims=True)
+    angle = np.arctan2(beside, ray[..., 2:])
     k = [camera.number(f"k{i}") for i in (1, 2, 3, 4)]
     seen = angle + sum(k_i * angle ** (2 * i + 3) for i, k_i in enumerate(k))
-    length = np.linalg.norm(ray[:2])
-    return centre + focal * (ray[:2] / length * seen if length else 0 * ray[:2])
+    return centre + focal * ray[..., :2] * np.divide(seen, beside, out=np.zeros_like(seen), where=beside > 0)
+
+
+def _radial(camera: Camera, ray: np.ndarray) -> np.ndarray:
+    """Where on the sensor, mm from the centre: of each ray by a root finder."""
+    undistorted = camera.number("f") * ray[..., :2] / ray[..., 2:]
+    radius = np.linalg.norm(undistorted, axis=-1, keepdims=True)
+    share = np.zeros_like(radius)
+    for n, wanted in enumerate(radius.ravel().tolist()):
+        if wanted > 0:
+            share.flat[n] = _distorted(camera, wanted) / wanted
+    return undistorted * share
+
+
+def _distorted(camera: Camera, radius: float) -> float:
+    """The distance from the centre, mm, at which a lens has what would be at that one without distortion."""
+
+    def beyond(r: float) -> float:
+        return r * radial_factor(camera, r * r) - radius
+
+    top = radius
+    while beyond(top) < 0:
+        top *= 1.5
+    return float(brentq(beyond, 0, top, xtol=1e-16, rtol=1e-15))
 
 
 def radtan(camera: Camera, point: np.ndarray) -> np.ndarray:
     """OpenCV's documentation, term by term."""
-    x, y = point
+    x, y = point[..., 0], point[..., 1]
     k1, k2, p1, p2, k3 = (camera.number(name) for name in ("k1", "k2", "p1", "p2", "k3"))
     r2 = x**2 + y**2
     scale = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return np.array(
+    return np.stack(
         [
             x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
             y * scale + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
-        ]
+        ],
+        axis=-1,
     )
 
 
@@ -68,7 +78,7 @@ def ray(camera: Camera, uv: np.ndarray) -> np.ndarray:
     if camera.model == "radial":
         size = np.array([camera.number("dx"), camera.number("dy")])
         mm = (uv - [camera.number("cx"), camera.number("cy")]) * size
-        return np.append(mm * radial_factor(camera, mm) / camera.number("f"), 1.0)
+        return np.append(mm * radial_factor(camera, mm @ mm) / camera.number("f"), 1.0)
     start = (uv - [camera.number("cx"), camera.number("cy")]) / [camera.number("fx"), camera.number("fy")]
     found = root(lambda xy: pixel(camera, np.append(xy, 1.0)) - uv, start, tol=1e-15)
     return np.append(found.x, 1.0)
@@ -92,7 +102,8 @@ def observed(camera: Camera, state: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def direction(y: np.ndarray) -> np.ndarray:
     """m(θ, φ)."""
-    return np.array([np.cos(y[4]) * np.sin(y[3]), -np.sin(y[4]), np.cos(y[4]) * np.cos(y[3])])
+    theta, phi = y[..., 3], y[..., 4]
+    return np.stack([np.cos(phi) * np.sin(theta), -np.sin(phi), np.cos(phi) * np.cos(theta)], axis=-1)
 
 
 def point(y: np.ndarray) -> np.ndarray:

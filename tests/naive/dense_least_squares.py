@@ -1,5 +1,7 @@
 """A factor graph solved with dense matrices: the twin of the solver."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from naive.dense_derived import parts_of
 from naive.dense_factors import TANGENT, boxminus, boxplus, jacobians, linear_ends, residual
@@ -90,10 +92,24 @@ class DenseGraph:
 
     def chi2(self) -> float:
         total = 0.0
-        for (kind, keys, z, information), (loss, k) in zip(self.factors, self.losses, strict=True):
-            r = residual(kind, [self.values[key] for key in keys], z)
-            total += rho(loss, k, r @ information @ r)
+        for rows, ends, z in self._alike():
+            kind, *_ = self.factors[rows[0]]
+            for n, r in zip(rows, residual(kind, ends, z), strict=True):
+                loss, k = self.losses[n]
+                total += rho(loss, k, r @ self.factors[n][3] @ r)
         return float(total)
+
+    def _alike(self) -> Iterator[tuple[list[int], list[np.ndarray], np.ndarray]]:
+        """Factors of one kind together: which they are, the values of their ends, what they have measured."""
+        alike: dict[tuple[str, int], list[int]] = {}
+        for n, (kind, _, z, _) in enumerate(self.factors):
+            alike.setdefault((kind, len(z)), []).append(n)
+        for rows in alike.values():
+            of = [self.factors[n] for n in rows]
+            ends = [
+                np.array([self.values[key] for key in keys]) for keys in zip(*(keys for _, keys, *_ in of), strict=True)
+            ]
+            yield rows, ends, np.array([z for _, _, z, _ in of])
 
     def starts(self) -> dict[int, int]:
         """First scalar of every free variable."""
@@ -109,17 +125,20 @@ class DenseGraph:
         starts = self.starts()
         n = sum(TANGENT[self.kinds[key]] for key in starts)
         information, eta = np.zeros((n, n)), np.zeros(n)
-        for (kind, keys, z, W), (loss, k) in zip(self.factors, self.losses, strict=True):
-            ends = [self.values[key] for key in keys]
-            r = residual(kind, ends, z)
-            if loss:
-                W = W * weight(loss, k, r @ W @ r)
-            H = np.zeros((len(r), n))
-            for key, J in zip(keys, jacobians(kind, CONNECTS[kind], ends, z), strict=True):
-                if key in starts:
-                    H[:, starts[key] : starts[key] + J.shape[1]] = J
-            information += H.T @ W @ H
-            eta -= H.T @ W @ r
+        for rows, ends, z in self._alike():
+            kind, *_ = self.factors[rows[0]]
+            Js = jacobians(kind, CONNECTS[kind], ends, z)
+            for row, r, *J in zip(rows, residual(kind, ends, z), *Js, strict=True):
+                (_, keys, _, W), (loss, k) = self.factors[row], self.losses[row]
+                if loss:
+                    W = W * weight(loss, k, r @ W @ r)
+                free = [e for e, key in enumerate(keys) if key in starts]
+                if not free:
+                    continue
+                H = np.hstack([J[e] for e in free])
+                at = np.concatenate([starts[keys[e]] + np.arange(J[e].shape[1]) for e in free])
+                information[np.ix_(at, at)] += H.T @ W @ H
+                eta[at] -= H.T @ W @ r
         return information, eta
 
     def gauss_newton(self, iterations: int) -> float:

@@ -1,36 +1,33 @@
 """Rotations and similarities as matrices, (3, 3) and (4, 4) with s R in them: the twin of `similarity`."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from naive.dense_poses import joined, length, motion, quaternion, rotation, times, turned
 
 
 def matrix(kind: str, x: np.ndarray) -> np.ndarray:
     if kind == "so3":
-        return Rotation.from_quat(x).as_matrix()
-    M = np.eye(4)
-    M[:3, :3], M[:3, 3] = x[7] * Rotation.from_quat(x[3:7]).as_matrix(), x[:3]
-    return M
+        return rotation(x)
+    return motion(x[..., 7, None, None] * rotation(x[..., 3:7]), x[..., :3])
 
 
 def value(kind: str, M: np.ndarray) -> np.ndarray:
     """With w ≥ 0."""
-    s = np.cbrt(np.linalg.det(M[:3, :3]))
-    q = Rotation.from_matrix(M[:3, :3] / s).as_quat(canonical=True)
-    return q if kind == "so3" else np.concatenate([M[:3, 3], q, [s]])
+    s = np.cbrt(np.linalg.det(M[..., :3, :3]))[..., None]
+    q = quaternion(M[..., :3, :3] / s[..., None])
+    return q if kind == "so3" else joined(M[..., :3, 3], q, s)
 
 
 def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
     if kind == "so3":
-        return value(kind, matrix(kind, x) @ Rotation.from_rotvec(delta).as_matrix())
-    step = np.eye(4)
-    step[:3, :3], step[:3, 3] = np.exp(delta[6]) * Rotation.from_rotvec(delta[3:6]).as_matrix(), delta[:3]
+        return value(kind, matrix(kind, x) @ turned(delta))
+    step = motion(np.exp(delta[..., 6, None, None]) * turned(delta[..., 3:6]), delta[..., :3])
     return value(kind, matrix(kind, x) @ step)
 
 
 def error(kind: str, M: np.ndarray) -> np.ndarray:
     """Of z⁻¹ ∘ x: its quaternion's vector part; of a similarity behind where it is, and before ln s."""
     x = value(kind, M)
-    return x[:3] if kind == "so3" else np.array([*x[:6], np.log(x[7])])
+    return x[..., :3] if kind == "so3" else joined(x[..., :6], np.log(x[..., 7:]))
 
 
 def boxminus(kind: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -40,16 +37,16 @@ def boxminus(kind: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     of = kind.split("_")[1]
-    M = [matrix(of, ends[0])]
+    M = matrix(of, ends[0])
     if kind.startswith("prior"):
-        return error(of, np.linalg.inv(matrix(of, z)) @ M[0])
+        return error(of, np.linalg.inv(matrix(of, z)) @ M)
     if kind.startswith("between"):
-        return error(of, np.linalg.inv(M[0] @ matrix(of, z)) @ matrix(of, ends[1]))
+        return error(of, np.linalg.inv(M @ matrix(of, z)) @ matrix(of, ends[1]))
     if kind == "attitude_so3":
-        return M[0].T @ z[3:] / np.linalg.norm(z[3:]) - z[:3] / np.linalg.norm(z[:3])
+        return times(np.swapaxes(M, -1, -2), z[..., 3:] / length(z[..., 3:])) - z[..., :3] / length(z[..., :3])
     if kind == "position_sim3":
-        return ends[0][:3] - z
-    return (np.linalg.inv(M[0]) @ np.append(ends[1], 1.0))[:3] - z
+        return ends[0][..., :3] - z
+    return times(np.linalg.inv(M), joined(ends[1], np.ones(1)))[..., :3] - z
 
 
 def measured(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:

@@ -149,10 +149,10 @@ def test_calls_that_wait_are_answered_in_order_and_too_many_are_told_so(served: 
     threads = [threading.Thread(target=lambda: answers.put(robot.call("/robot1/mapper/settle")[:2])) for _ in range(20)]
     for thread in threads:
         thread.start()
-    full = [answers.get(timeout=30) for _ in range(3)]  # one is being answered, and sixteen wait
+    full = [answers.get(timeout=60) for _ in range(3)]  # one is being answered, and sixteen wait
     assert full == 3 * [(False, "16 calls wait already; call again later")]
     joined.may_settle.set()
-    assert all(answers.get(timeout=30)[0] for _ in range(17))
+    assert all(answers.get(timeout=60)[0] for _ in range(17))
     for thread in threads:
         thread.join()
 
@@ -185,7 +185,11 @@ def test_an_attachment_of_another_form_is_nobodys() -> None:
 def test_a_false_closure_goes_by_services_alone(endpoint: str, spawn: Callable[..., Process], tmp_path: Path) -> None:
     """On a real map: a robot drives on while it is repaired, saved and forked."""
     saved = tmp_path / "saved"
-    with ros.session(endpoint) as session, connect(endpoint, client="looker") as bus, bus.map("served") as looked:
+    with (
+        ros.session(endpoint) as session,
+        connect(endpoint, client="looker", timeout_s=60) as bus,
+        bus.map("served") as looked,
+    ):
         joined = bridge(spawn, endpoint, "served", 21, "--save-folder", str(saved))
         robot = ros.RosNode(session, 21)
         robot.subscribe("/tf", words.TFMessage)

@@ -94,10 +94,10 @@ def test_admissible_extremes_never_poison_a_map(mode: str, record_property: Any)
     codes = Counter[str]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        for seed in range(first, first + 60):
+        for seed in range(first, first + 30):  # and others in the next run
             codes += fuzz(mode, seed, 25)
     record_property("codes", dict(codes))
-    assert codes["accepted"] > 100, codes
+    assert codes["accepted"] > 50, codes
 
 
 def start(mode: str) -> Map:

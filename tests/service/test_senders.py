@@ -27,7 +27,7 @@ def settle(control: SerialExecutor) -> None:
     """Return when the control thread is done with what it has."""
     reached = threading.Event()
     control.hand(reached.set)
-    assert reached.wait(10)
+    assert reached.wait(60)
 
 
 def remembered(senders: Senders, control: SerialExecutor, *clients: str) -> list[str]:

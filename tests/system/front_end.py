@@ -15,7 +15,7 @@ SIGMAS = (0.1, 0.1, 0.02)
 def main() -> None:
     endpoint, name, letter, poses = sys.argv[1:]
     random = np.random.default_rng(ord(letter))
-    with connect(endpoint, client=letter) as bus, bus.map(name, window=8) as driven:
+    with connect(endpoint, client=letter, timeout_s=60) as bus, bus.map(name, window=8) as driven:
         print("ready", flush=True)
         sys.stdin.readline()
         driven.insert(Draft().se2(f"{letter}0", (ord(letter), 0, 0), fixed=True), timeout_s=60)

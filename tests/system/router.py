@@ -19,7 +19,7 @@ def main() -> None:
     }.items():
         config.insert_json5(path, json.dumps(value))
     with zenoh.open(config) as session:
-        for reply in session.get(f"@/{session.info.zid()}/router", timeout=5.0):
+        for reply in session.get(f"@/{session.info.zid()}/router", timeout=60.0):
             if reply.ok is not None:
                 print("ready", *json.loads(reply.ok.payload.to_bytes())["locators"], flush=True)
         sys.stdin.read()

@@ -32,7 +32,7 @@ def test_everybody_meets_at_a_router_that_enforces(tmp_path: Path, spawn: Spawn)
     spawn("-m", "factorbus.workers", *own, str(secured.clients["w1"]), "--name", "w1", "--no-warm").ready()
     with (
         connect(router, client="robot1", zenoh=secured.clients["robot1"]) as bus,
-        connect(router, client="wall", zenoh=secured.clients["wall"], timeout_s=30) as wall,
+        connect(router, client="wall", zenoh=secured.clients["wall"], timeout_s=60) as wall,
         connect(router, client="ops", zenoh=secured.clients["ops"]) as ops,
         bus.map("kitchen", create=False) as kitchen,
         wall.map("kitchen", create=False) as picture,

@@ -47,7 +47,7 @@ def how_far_off(hall: Map, one: Drive, other: Drive) -> float:
 
 def test_two_maps_become_one(endpoint: str) -> None:
     one, other, candidates = drives(1, 12, 20, 0)
-    with connect(endpoint, client="merger") as bus, bus.map("hall-a") as hall, bus.map("yard-a") as yard:
+    with connect(endpoint, client="merger", timeout_s=60) as bus, bus.map("hall-a") as hall, bus.map("yard-a") as yard:
         fill(hall, one)
         fill(yard, other)
         found = align(hall, yard, drafted(candidates), letters=LETTERS)
@@ -65,7 +65,7 @@ def test_two_maps_become_one(endpoint: str) -> None:
 
 def test_what_is_ambiguous_or_too_little_is_not_merged(endpoint: str) -> None:
     one, other, candidates = drives(4, 10, 0, 9)
-    with connect(endpoint, client="merger") as bus, bus.map("hall-b") as hall, bus.map("yard-b") as yard:
+    with connect(endpoint, client="merger", timeout_s=60) as bus, bus.map("hall-b") as hall, bus.map("yard-b") as yard:
         fill(hall, one)
         fill(yard, other)
         found = align(hall, yard, drafted(candidates), letters=LETTERS)
@@ -102,7 +102,7 @@ def command(endpoint: str, *rest: str) -> subprocess.CompletedProcess[str]:
 
 def test_from_a_shell(endpoint: str, tmp_path: Path) -> None:
     one, other, candidates = drives(6, 8, 8, 0)
-    with connect(endpoint, client="merger") as bus, bus.map("hall-c") as hall, bus.map("yard-c") as yard:
+    with connect(endpoint, client="merger", timeout_s=60) as bus, bus.map("hall-c") as hall, bus.map("yard-c") as yard:
         fill(hall, one)
         fill(yard, other)
     file, sigmas = tmp_path / "matches.txt", ",".join(map(str, SIGMAS))
@@ -127,5 +127,5 @@ def test_from_a_shell(endpoint: str, tmp_path: Path) -> None:
     done = command(endpoint, *asked, "--sigmas", sigmas)
     assert done.returncode == 0, done.stderr
     assert "8 of 16 agree" in done.stdout
-    with connect(endpoint, client="looker") as bus, bus.map("hall-c") as hall:
+    with connect(endpoint, client="looker", timeout_s=60) as bus, bus.map("hall-c") as hall:
         assert how_far_off(hall, one, other) < 3.0

@@ -12,9 +12,9 @@ from factorbus.simulate import monocular
 
 def test_features_become_points_while_a_mirror_follows(endpoint: str) -> None:
     with (
-        connect(endpoint, client="camera") as bus,
+        connect(endpoint, client="camera", timeout_s=60) as bus,
         bus.map("observations") as joined,
-        connect(endpoint, client="viewer") as other,
+        connect(endpoint, client="viewer", timeout_s=60) as other,
         other.map("observations") as watched,
     ):
         far = Far(joined)
@@ -43,7 +43,7 @@ def test_features_become_points_while_a_mirror_follows(endpoint: str) -> None:
 
 def test_what_no_camera_can_see_is_refused_and_losses_travel(endpoint: str) -> None:
     camera = CAMERAS["radtan"]
-    with connect(endpoint, client="camera2") as bus, bus.map("losses") as joined:
+    with connect(endpoint, client="camera2", timeout_s=60) as bus, bus.map("losses") as joined:
         draft = Draft().se3("x0", (0, 0, 0, 0, 0, 0, 1), fixed=True).point3("p0", (0, 0, 4))
         draft.prior_point3("p0", (0, 0, 4), sigmas=(1, 1, 1))
         draft.point_seen("x0", "p0", camera, (380, 260), sigmas=(1, 1), loss=("huber", 1.5))

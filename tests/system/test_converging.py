@@ -81,12 +81,12 @@ def test_a_map_that_has_converged_is_polished_when_it_is_left_alone(endpoint: st
     """To a millionth of χ²; `converged` allows a thousandth."""
     judge, name = Solver(Options(mode="all-batch")), f"polished-{mode}-{world}"
     with connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus, bus.map(name, mode) as joined:
-        deltas, report = Deltas(joined), {}
+        deltas, report, inserted = Deltas(joined), {}, 0
         for step in WORLDS[world](200, 7):
-            report = joined.insert(step.batch).report
+            answer = joined.insert(step.batch)
+            report, inserted = answer.report, answer.revision
             judge.stage(step.batch)
         judge.step(settle=True)
-        inserted = joined.estimate.revision
         joined.wait_converged(PATIENCE_S)
         left = [delta for delta in deltas.all if delta.revision > inserted]
         assert all(delta in deltas.further() for delta in left)
@@ -107,9 +107,9 @@ def test_killed_before_it_is_polished_it_comes_to_the_same_bits(
     for name in ("whole", "stopped"):
         running = services(tmp_path / name)
         with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("m2", mode) as joined:
+            inserted = 0
             for step in WORLDS["manhattan"](120, 7):
-                joined.insert(step.batch)
-            inserted = joined.stats()["revision"]
+                inserted = joined.insert(step.batch).revision
             if name == "stopped":
                 running.end(signal.SIGKILL)
                 running.start()

@@ -51,14 +51,14 @@ def test_two_front_ends_and_eight_viewers_end_with_the_same_bits(endpoint: str, 
 
 
 def test_a_stopped_viewer_slows_nobody_and_catches_up(endpoint: str, spawn: Spawn) -> None:
-    with connect(endpoint, client="robot") as bus, bus.map("busy", mirror=False) as driven:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("busy", mirror=False) as driven:
         ring(driven, 1500)
         watching = viewer(spawn, endpoint, "busy")
         watching.signal(signal.SIGSTOP)
         # Enough deltas of the whole map (48 kB each) to fill every buffer on the way to the stopped one.
         # A blocking publication would wait a second for it, five times as long as the patience for all.
         within_patience(lambda: move(driven, int(5 * PATIENCE_S)))
-        last = driven.insert(Draft().between_se2("x1", "x3", (2, 0, 0), sigmas=(1, 1, 1)), timeout_s=30).revision
+        last = driven.insert(Draft().between_se2("x1", "x3", (2, 0, 0), sigmas=(1, 1, 1)), timeout_s=60).revision
         watching.signal(signal.SIGCONT)
         (seen,) = shown([watching], last)
     assert int(seen[0]) >= last, "it has the last insert, or a further step after it"
@@ -87,4 +87,4 @@ def move(driven: object, inserts: int) -> None:
         draft = Draft().between_se2("x1497", "x1499", off, sigmas=(0.1, 0.1, 0.1)).between_se2(
             "x0", "x1499", (300, 900 + 0.01 * (n % 5), 3), sigmas=(50, 50, 1)
         )  # fmt: skip
-        driven.insert(draft, timeout_s=30)  # type: ignore[attr-defined]
+        driven.insert(draft, timeout_s=60)  # type: ignore[attr-defined]

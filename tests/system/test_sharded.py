@@ -39,6 +39,7 @@ def test_spread_move_and_restart(spawn: Spawn) -> None:
 
         # Move: its front ends have left; the graph goes to the other shard under a name of its own; drop.
         with bus.map("shard0-hall", create=False) as old, bus.map("shard1-hall") as new:
+            old.wait_converged()  # which makes no further step by itself
             graph = old.graph()
             new.insert(graph.batch)
             new.settle()

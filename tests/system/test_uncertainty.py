@@ -151,7 +151,7 @@ def test_refusals_carry_their_codes(square: tuple[Map, Solver], named: list[str]
 
 
 def test_an_empty_map_has_no_last_pose(endpoint: str) -> None:
-    with connect(endpoint, client="asker") as bus, bus.map("empty", "bayes-tree") as empty:
+    with connect(endpoint, client="asker", timeout_s=60) as bus, bus.map("empty", "bayes-tree") as empty:
         with pytest.raises(Refused) as refused:
             empty.uncertainty.last()
         assert refused.value.code == "unknown_variable"

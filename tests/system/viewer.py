@@ -23,7 +23,7 @@ def digest(shown: Map) -> str:
 
 def main() -> None:
     endpoint, name = sys.argv[1:]
-    with connect(endpoint, client="viewer") as bus, bus.map(name) as shown:
+    with connect(endpoint, client="viewer", timeout_s=60) as bus, bus.map(name) as shown:
         print("ready", flush=True)
         for line in sys.stdin:
             shown.estimate.wait_for(int(line.split()[1]), timeout_s=60)
