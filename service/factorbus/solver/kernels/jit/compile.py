@@ -1,4 +1,4 @@
-"""How kernels are compiled and kept: numba is imported here, in `lowering` and in `disk`; flags are chosen here.
+"""How kernels are compiled and kept: flags are chosen here.  What is changed inside Numba is in `lowering`.
 
 `kernel`         compiled on first use, without the interpreter lock, kept on disk.  With signatures it accepts exactly
                  those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")

@@ -27,6 +27,10 @@ from numba.core.typed_passes import NativeLowering
 from numba.np import arrayobj
 from numba.np.arrayobj import load_item, store_item
 
+from .calls import FoldingBuilder, arguments_of, caller_of, declare_part, has_short_call, is_short
+from .held import drop_unused, find_held
+from .loops import LOOPS, is_range, lower_loop, make_range
+
 _from_the_end = arrayobj.fix_integer_index
 
 
@@ -48,12 +52,28 @@ class OurLower(Lower):
     so such a one does count.  One that has no arrays but those, and their rows and blocks, counts nothing at all.
     """
 
-    def pre_lower(self) -> None:
-        super().pre_lower()
+    def init(self) -> None:
         self.module.factorbus = True
         self.module.factorbus_borrows = self._is_plain(self.fndesc.restype) and not any(
             self._is_owner(expression, signature) for expression, signature in self.fndesc.calltypes.items()
         )
+        super().init()
+
+    def setup_function(self, fndesc: Any) -> None:
+        super().setup_function(fndesc)
+        self._fold()
+
+    def lower_normal_function(self, fndesc: Any) -> None:
+        super().lower_normal_function(fndesc)
+        drop_unused(self.function)
+
+    def _fold(self) -> None:
+        self.builder = FoldingBuilder(self.entry_block)
+        self.call_helper = self.call_conv.init_call_helper(self.builder)
+
+    def _find_singly_assigned_variable(self) -> None:
+        super()._find_singly_assigned_variable()
+        self._singly_assigned_vars |= {name for name in find_held(self.blocks) if self._counts_nothing(name)}
 
     def _is_owner(self, expression: Any, signature: Any) -> bool:
         """Whether what it comes to may be, or have, an array of its own."""
@@ -62,9 +82,14 @@ class OurLower(Lower):
         looks_at = getattr(expression, "op", None) in {"getitem", "static_getitem"}
         return not looks_at or any(map(_has_array, signature.args[1:]))
 
+    def _counts_nothing(self, name: str) -> bool:
+        return self.module.factorbus_borrows or self._is_plain(self.typeof(name))
+
     def _is_plain(self, kind: Any) -> bool:
         """Whether there are no references to count in it."""
         return not self.context.data_model_manager[kind].contains_nrt_meminfo()
+
+    _called_short = False
 
     def lower_assign(self, ty: Any, inst: Any) -> Any:
         given = inst.value
@@ -72,14 +97,34 @@ class OurLower(Lower):
         if not (borrowed and self._is_plain(self.fndesc.restype)):
             return super().lower_assign(ty, inst)
         value = self.context.cast(self.builder, self.fnargs[given.index], self.typeof(f"arg.{given.name}"), ty)
+        if self._called_short and is_short(self.context, self.fndesc, self.typeof(f"arg.{given.name}")):
+            return value
         array = self.context.make_array(ty)(self.context, self.builder, value)
         array.meminfo, array.parent = (cgutils.get_null_value(owner.type) for owner in (array.meminfo, array.parent))
         return array._getvalue()
 
     def delvar(self, name: str) -> None:
         """Nothing, where there is no reference to give up.  Numba loads what is not needed any more, and stores 0."""
-        if not (self.module.factorbus_borrows or self._is_plain(self.typeof(name))):
+        if not self._counts_nothing(name):
             super().delvar(name)
+
+    def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
+        """Without a look at what was there before, where it has no reference to give up."""
+        if name in self._singly_assigned_vars or not self._counts_nothing(name):
+            super().storevar(value, name, argidx)
+        else:
+            self.builder.store(value, self.getvar(name))
+
+    def lower_call(self, resty: Any, expr: Any) -> Any:
+        function, signature = self.typeof(expr.func.name), self.fndesc.calltypes[expr]
+        if not is_range(function, signature):
+            return super().lower_call(resty, expr)
+        bounds = self.fold_call_args(function, signature, expr.args, expr.vararg, expr.kws)
+        return make_range(self.builder, self.context, list(bounds))
+
+    def lower_expr(self, resty: Any, expr: Any) -> Any:
+        made = lower_loop(self, expr) if expr.op in LOOPS else None
+        return super().lower_expr(resty, expr) if made is None else made
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
         place = self._place_of_number(value.name, index.name)
@@ -113,10 +158,10 @@ class OurLower(Lower):
             return None
         builder, model, value = self.builder, self.context.data_model_manager[array], self.loadvar(index)
         indices = [value] if kinds == (kind,) else cgutils.unpack_tuple(builder, value, len(kinds))
-        value = self.loadvar(name)
-        shape = cgutils.unpack_tuple(builder, model.get(builder, value, "shape"), array.ndim)
+        value, shape = self.loadvar(name), model.get_field_position("shape")
         place = None
-        for axis, (one, of, size) in enumerate(zip(indices, kinds, shape, strict=True)):
+        for axis, (one, of) in enumerate(zip(indices, kinds, strict=True)):
+            size = builder.extract_value(value, (shape, axis))
             number = self.context.cast(builder, one, of, types.intp)
             if getattr(of, "literal_value", 0) < 0 or (isinstance(one, ir.Constant) and one.constant < 0):
                 number = builder.add(size, number)
@@ -298,11 +343,34 @@ class KernelCompiler(_Compiler):
         super().__init__(typingctx, targetctx, library, args, return_type, ours, names)
 
 
+class _PartLower(OurLower):
+    """The code of a part, which is called in our own way."""
+
+    def setup_function(self, fndesc: Any) -> None:
+        self._called_short = has_short_call(fndesc)
+        if not self._called_short:
+            super().setup_function(fndesc)
+            return
+        self.function = declare_part(self.context, self.module, fndesc)
+        self.entry_block = self.function.append_basic_block("entry")
+        self._fold()
+
+    def extract_function_arguments(self) -> Any:
+        if not self._called_short:
+            return super().extract_function_arguments()
+        self.fnargs = arguments_of(self.context, self.builder, self.fndesc, self.function)
+        return self.fnargs
+
+
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _PartLowering(_Lowering):
     """Lowering that ends with the code that others link."""
 
     _name = "part_lowering"
+
+    @property
+    def lowering_class(self) -> type[Lower]:
+        return _PartLower
 
     def run_pass(self, state: Any) -> bool:
         state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = state.flags.no_compile = True
@@ -310,7 +378,11 @@ class _PartLowering(_Lowering):
         state.library.finalize()
         called_by = object()  # the name by which the code of others calls it
         state.cr = state.cr._replace(cfunc=called_by)
-        state.targetctx.insert_user_function(called_by, state.cr.fndesc, [state.library])
+        if has_short_call(state.cr.fndesc):
+            call = caller_of(state.cr.fndesc, (state.library,))
+            state.targetctx._defns[called_by].append(call, call.signature)
+        else:
+            state.targetctx.insert_user_function(called_by, state.cr.fndesc, [state.library])
         return True
 
 
