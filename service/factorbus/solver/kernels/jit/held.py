@@ -8,11 +8,12 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
+from llvmlite import ir as llvm
 from llvmlite.ir import instructions as code
 from numba.core import ir
 from numba.core.analysis import compute_cfg_from_blocks, compute_use_defs
 
-__all__ = ["drop_unused", "find_held"]
+__all__ = ["FoldingBuilder", "drop_unused", "find_held"]
 
 # What only gives a value.
 _PURE = {
@@ -28,6 +29,23 @@ _PURE = {
     "sub",
     "xor",
 }
+
+
+class FoldingBuilder(llvm.IRBuilder):
+    """Writes no instruction to take out of a record or an array what was put into it in the same function."""
+
+    def extract_value(self, agg: Any, idx: Any, name: str = "") -> Any:
+        """What is at this place; a number, or the numbers of the way to it."""
+        path = tuple(idx) if isinstance(idx, tuple | list) else (idx,)
+        while isinstance(agg, code.InsertValue):
+            place = tuple(agg.indices)
+            if path[: len(place)] == place:
+                rest = path[len(place) :]
+                return self.extract_value(agg.value, rest, name) if rest else agg.value
+            if place[: len(path)] == path:
+                break  # a part of what is asked for
+            agg = agg.aggregate
+        return super().extract_value(agg, path, name)
 
 
 def find_held(blocks: Mapping[int, Any]) -> set[str]:

@@ -27,9 +27,7 @@ from numba.core.typed_passes import NativeLowering
 from numba.np import arrayobj
 from numba.np.arrayobj import load_item, store_item
 
-from .calls import FoldingBuilder, arguments_of, caller_of, declare_part, has_short_call, is_short
-from .held import drop_unused, find_held
-from .loops import LOOPS, is_range, lower_loop, make_range
+from .held import FoldingBuilder, drop_unused, find_held
 
 _from_the_end = arrayobj.fix_integer_index
 
@@ -61,15 +59,12 @@ class OurLower(Lower):
 
     def setup_function(self, fndesc: Any) -> None:
         super().setup_function(fndesc)
-        self._fold()
+        self.builder = FoldingBuilder(self.entry_block)
+        self.call_helper = self.call_conv.init_call_helper(self.builder)
 
     def lower_normal_function(self, fndesc: Any) -> None:
         super().lower_normal_function(fndesc)
         drop_unused(self.function)
-
-    def _fold(self) -> None:
-        self.builder = FoldingBuilder(self.entry_block)
-        self.call_helper = self.call_conv.init_call_helper(self.builder)
 
     def _find_singly_assigned_variable(self) -> None:
         super()._find_singly_assigned_variable()
@@ -89,16 +84,12 @@ class OurLower(Lower):
         """Whether there are no references to count in it."""
         return not self.context.data_model_manager[kind].contains_nrt_meminfo()
 
-    _called_short = False
-
     def lower_assign(self, ty: Any, inst: Any) -> Any:
         given = inst.value
         borrowed = isinstance(given, numba_ir.Arg) and isinstance(ty, types.Array)
         if not (borrowed and self._is_plain(self.fndesc.restype)):
             return super().lower_assign(ty, inst)
         value = self.context.cast(self.builder, self.fnargs[given.index], self.typeof(f"arg.{given.name}"), ty)
-        if self._called_short and is_short(self.context, self.fndesc, self.typeof(f"arg.{given.name}")):
-            return value
         array = self.context.make_array(ty)(self.context, self.builder, value)
         array.meminfo, array.parent = (cgutils.get_null_value(owner.type) for owner in (array.meminfo, array.parent))
         return array._getvalue()
@@ -114,17 +105,6 @@ class OurLower(Lower):
             super().storevar(value, name, argidx)
         else:
             self.builder.store(value, self.getvar(name))
-
-    def lower_call(self, resty: Any, expr: Any) -> Any:
-        function, signature = self.typeof(expr.func.name), self.fndesc.calltypes[expr]
-        if not is_range(function, signature):
-            return super().lower_call(resty, expr)
-        bounds = self.fold_call_args(function, signature, expr.args, expr.vararg, expr.kws)
-        return make_range(self.builder, self.context, list(bounds))
-
-    def lower_expr(self, resty: Any, expr: Any) -> Any:
-        made = lower_loop(self, expr) if expr.op in LOOPS else None
-        return super().lower_expr(resty, expr) if made is None else made
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
         place = self._place_of_number(value.name, index.name)
@@ -343,34 +323,11 @@ class KernelCompiler(_Compiler):
         super().__init__(typingctx, targetctx, library, args, return_type, ours, names)
 
 
-class _PartLower(OurLower):
-    """The code of a part, which is called in our own way."""
-
-    def setup_function(self, fndesc: Any) -> None:
-        self._called_short = has_short_call(fndesc)
-        if not self._called_short:
-            super().setup_function(fndesc)
-            return
-        self.function = declare_part(self.context, self.module, fndesc)
-        self.entry_block = self.function.append_basic_block("entry")
-        self._fold()
-
-    def extract_function_arguments(self) -> Any:
-        if not self._called_short:
-            return super().extract_function_arguments()
-        self.fnargs = arguments_of(self.context, self.builder, self.fndesc, self.function)
-        return self.fnargs
-
-
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _PartLowering(_Lowering):
     """Lowering that ends with the code that others link."""
 
     _name = "part_lowering"
-
-    @property
-    def lowering_class(self) -> type[Lower]:
-        return _PartLower
 
     def run_pass(self, state: Any) -> bool:
         state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = state.flags.no_compile = True
@@ -378,11 +335,7 @@ class _PartLowering(_Lowering):
         state.library.finalize()
         called_by = object()  # the name by which the code of others calls it
         state.cr = state.cr._replace(cfunc=called_by)
-        if has_short_call(state.cr.fndesc):
-            call = caller_of(state.cr.fndesc, (state.library,))
-            state.targetctx._defns[called_by].append(call, call.signature)
-        else:
-            state.targetctx.insert_user_function(called_by, state.cr.fndesc, [state.library])
+        state.targetctx.insert_user_function(called_by, state.cr.fndesc, [state.library])
         return True
 
 
