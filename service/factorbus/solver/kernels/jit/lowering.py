@@ -5,8 +5,8 @@ read and written in a few instructions.  A part stays as it was written until a 
 is its own.
 
 All of this is Numba's private side, so it is done with releases that were tested (`releases`), and three functions of
-Numba's are exchanged only while a function of ours is compiled (`changed_numba`).  What each change is worth is in
-docs/decisions/private-numba.md.
+Numba's are exchanged only while a function of ours is compiled (`changed_numba`), four in a process that compiles for
+others alone.  What each change is worth is in docs/decisions/private-numba.md.
 """
 
 from collections.abc import Iterator
@@ -23,11 +23,12 @@ from numba.core.compiler import Compiler, Flags
 from numba.core.compiler_machinery import register_pass
 from numba.core.lowering import Lower
 from numba.core.runtime.context import NRTContext
-from numba.core.typed_passes import NativeLowering
+from numba.core.typed_passes import BaseNativeLowering, NativeLowering
 from numba.np import arrayobj
 from numba.np.arrayobj import load_item, store_item
 
 from .held import FoldingBuilder, drop_unused, find_held
+from .shared import compiles_for_others
 
 _from_the_end = arrayobj.fix_integer_index
 
@@ -114,6 +115,10 @@ class OurLower(Lower):
         return self.context.cast(self.builder, load_item(self.context, self.builder, array, place), array.dtype, resty)
 
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
+        given, into = self.typeof(value_var.name), self.typeof(target_var.name)
+        if isinstance(into, types.Array) and isinstance(given, types.Array):
+            # Not a path that is missing: thirty functions of Numba's, to say of arrays of unlike sizes what they are.
+            raise NotImplementedError(f"{given}, assigned to a part of another array; a kernel copies number by number")
         place = self._place_of_number(target_var.name, index_var.name)
         if place is None:
             return super().lower_setitem(target_var, index_var, value_var, signature)
@@ -165,6 +170,15 @@ def _count_owned(self: Any, builder: Any, typ: Any, value: Any, funcname: str) -
         _count(self, builder, typ, value, funcname)
 
 
+_lower = BaseNativeLowering.run_pass
+
+
+def _lower_for_kernels(self: Any, state: Any) -> bool:
+    """Without what C would call it by, which nobody does in a process that compiles for others alone."""
+    state.flags.no_cfunc_wrapper = True
+    return _lower(self, state)
+
+
 _find_call_type = types.BaseFunction.get_call_type
 _call_types: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by the identity of the function, which is kept with them
 
@@ -186,14 +200,17 @@ _EXCHANGED = (
     (NRTContext, "_call_incref_decref", _count_owned),
     (types.BaseFunction, "get_call_type", _known_call_type),
 )
+# In a process where Numba keeps nothing for others: all that it compiles is for kernels.
+_EXCHANGED_APART = (*_EXCHANGED, (BaseNativeLowering, "run_pass", _lower_for_kernels))
 
 
 @contextmanager
 def changed_numba() -> Iterator[None]:
     """Numba with our functions in place of its own, which are back afterwards.  For who holds the compiler's lock."""
-    found = [(owner, name, getattr(owner, name)) for owner, name, _ in _EXCHANGED]
+    exchanged = _EXCHANGED_APART if compiles_for_others() else _EXCHANGED
+    found = [(owner, name, getattr(owner, name)) for owner, name, _ in exchanged]
     try:
-        for owner, name, ours in _EXCHANGED:
+        for owner, name, ours in exchanged:
             setattr(owner, name, ours)
         yield
     finally:
