@@ -6,7 +6,8 @@
 #     deploy/setup/try-numba.sh FOLDER RELEASE[,RELEASE...] [TESTS...]        RELEASE as 0.67, for the newest of those, or 0.67.0
 #
 # FOLDER keeps the environments and compiled kernels for the next time.  Without TESTS it runs tests/solver: with Numba as it
-# is, to compile the step alone takes some minutes.  WAYS=stock or WAYS=changed in the environment: only that way.
+# is, to compile the step alone takes some minutes.  WAYS=stock or WAYS=changed in the environment: only that way.  TIMEOUT:
+# seconds for one test, 1200 by default; the first one compiles, and a machine with other work needs more.
 set -euo pipefail
 
 main() {
@@ -31,10 +32,10 @@ main() {
 environment() {
     local venv=$1/venv release=$2 here=$3
     [[ $release = *.*.* ]] || release=$release.*
-    [ -x "$venv/bin/pytest" ] && return 0
+    "$venv/bin/python" -c 'import gtsam, hypothesis, pytest, pytest_timeout' 2>/dev/null && return 0
     "${PYTHON:-python3}" -m venv --clear "$venv"
     "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$here[service]" "numba==$release" \
-        "hypothesis>=6.100" "pytest>=8" "pytest-timeout>=2.3"
+        "gtsam>=4.3" "hypothesis>=6.100" "pytest>=8" "pytest-timeout>=2.3"
 }
 
 # 0: changed, whatever the release.
@@ -44,7 +45,7 @@ try() {
     installed=$("$folder/venv/bin/python" -c 'from importlib.metadata import version; print(version("numba"))')
     echo "numba $installed, $how"
     FACTORBUS_STOCK_NUMBA=$stock FACTORBUS_CACHE=$folder/cache \
-        "$folder/venv/bin/python" -m pytest -q -p no:cacheprovider -m "not data" --timeout 1200 "$@"
+        "$folder/venv/bin/python" -m pytest -q -p no:cacheprovider -m "not data" --timeout "${TIMEOUT:-1200}" "$@"
 }
 
 main "$@"

@@ -12,12 +12,13 @@ import pytest
 
 from factorbus.solver.kernels.jit import compile as _jit
 from factorbus.solver.kernels.jit import disk as _disk
+from factorbus.solver.kernels.jit import held as _held
 from factorbus.solver.kernels.jit import lowering as _lowering
 from factorbus.solver.kernels.jit import releases as _releases
 from factorbus.solver.kernels.jit import shared as _shared
 from factorbus.solver.kernels.jit import stamps as _stamps
 
-MAKERS = [Path(one.__file__) for one in (_disk, _jit, _lowering, _releases, _shared, _stamps)]
+MAKERS = [Path(one.__file__) for one in (_disk, _held, _jit, _lowering, _releases, _shared, _stamps)]
 CALLER = """
 from kernels.jit import compile as _jit
 from kernels.callee import twice
@@ -185,6 +186,36 @@ def test_a_kernel_shows_others_nothing_of_its_parts(kernels):
     done = run(kernels, LIST_SYMBOLS)
     shown, own = done.stdout.splitlines()
     assert shown == own
+
+
+FOR_OTHERS = """
+import numpy as np
+from numba.core.lowering import BaseLower
+from kernels.jit import compile as _jit
+
+write, written = BaseLower.create_cfunc_wrapper, []
+
+def counted(lower):
+    written.append(lower.fndesc.qualname)
+    write(lower)
+
+BaseLower.create_cfunc_wrapper = counted
+
+@_jit.kernel("int64(int64)")
+def sum_of_new(n):
+    return np.zeros(n, np.int64).sum()
+{first}
+list(_jit.iter_compile(sum_of_new))
+print(any("zeros" in name for name in written), any("sum_of_new" in name for name in written))
+"""
+
+
+@pytest.mark.skipif(_jit.STOCK, reason="Numba as it is writes each function as C would call it")
+def test_what_numba_adds_is_not_written_for_c_where_nothing_is_run(kernels):
+    for name, first, wanted in (("runs", "", "True False\n"), ("compiles", "_jit.only_compile()", "False False\n")):
+        (kernels / f"{name}.py").write_text(FOR_OTHERS.format(first=first))
+        done = run(kernels, f"import kernels.{name}")
+        assert (done.stdout, done.stderr) == (wanted, "")
 
 
 INLINE_FIRST = """

@@ -15,7 +15,8 @@ def larger(a, n):
     if a.size >= n:
         return a
     b = np.zeros(n)
-    b[: a.size] = a
+    for k in range(a.size):
+        b[k] = a[k]
     return b
 
 
@@ -113,3 +114,22 @@ def test_what_is_copied_in_passing_is_given_back(kernel, more):
     _nrt_python.memsys_disable_stats()
     assert after.alloc - before.alloc == after.free - before.free > 0
     assert sys.getrefcount(rows) == references
+
+
+@_jit.kernel("void(float64[:,::1], float64[::1])")
+def put_row(rows, row):
+    rows[1] = row
+
+
+@_jit.kernel("void(float64[:,::1], float64[::1])")
+def put_slice(rows, row):
+    rows[0, 1:] = row
+
+
+@pytest.mark.skipif(_jit.DISABLED or _jit.STOCK, reason="Python, and Numba as it is, assign arrays")
+@pytest.mark.parametrize("kernel", [put_row, put_slice])
+def test_an_array_that_is_assigned_to_a_part_of_another_is_refused(kernel):
+    with pytest.raises(
+        NotImplementedError, match="assigned to a part of another array; a kernel copies number by number"
+    ):
+        kernel(np.zeros((2, 3)), np.ones(3))

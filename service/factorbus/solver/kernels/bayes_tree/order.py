@@ -88,7 +88,8 @@ def raise_hubs(n: int, m: int, near: I64, begin: I64, length: I64, elements: I64
     variables come m elements; the group of an element is the last one of its members.
     """
     last = np.zeros(n + m, np.int64)
-    last[:n] = group
+    for k in range(n):
+        last[k] = group[k]
     for e in range(n, n + m):
         for at_member in range(begin[e], begin[e] + length[e]):
             last[e] = max(last[e], group[near[at_member]])

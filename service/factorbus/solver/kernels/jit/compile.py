@@ -1,4 +1,4 @@
-"""How kernels are compiled and kept: numba is imported here, in `lowering` and in `disk`; flags are chosen here.
+"""How kernels are compiled and kept: flags are chosen here.  What is changed inside Numba is in `lowering`.
 
 `kernel`         compiled on first use, without the interpreter lock, kept on disk.  With signatures it accepts exactly
                  those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")
@@ -14,8 +14,8 @@ numba and llvmlite, and the processor.  In it a kernel is a file named by all th
 Numba itself looks only at the file that holds a kernel, so it would run a stale kernel after a callee in another file
 was edited.  How a function is compiled says the `KernelFolder` that decorates it.
 
-No slice or row is assigned an array, and none is sorted by NumPy's way: to compile what the one says of unlike sizes,
-and the other, takes three seconds in each process.
+No slice or row is assigned an array, which is refused, and none is sorted by NumPy's way: to compile what the one says
+of unlike sizes, and the other, takes three seconds in each process.
 
 An index is 0 or more, or a constant that is written where it is used, as in `a[-1]` and `a[-1, k]`, but not in
 `a[-1, 1:]`, which is refused; ends of slices may be anything.

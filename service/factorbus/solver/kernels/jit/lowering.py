@@ -5,8 +5,8 @@ read and written in a few instructions.  A part stays as it was written until a 
 is its own.
 
 All of this is Numba's private side, so it is done with releases that were tested (`releases`), and three functions of
-Numba's are exchanged only while a function of ours is compiled (`changed_numba`).  What each change is worth is in
-docs/decisions/private-numba.md.
+Numba's are exchanged only while a function of ours is compiled (`changed_numba`), four in a process that compiles for
+others alone.  What each change is worth is in docs/decisions/private-numba.md.
 """
 
 from collections.abc import Iterator
@@ -23,9 +23,12 @@ from numba.core.compiler import Compiler, Flags
 from numba.core.compiler_machinery import register_pass
 from numba.core.lowering import Lower
 from numba.core.runtime.context import NRTContext
-from numba.core.typed_passes import NativeLowering
+from numba.core.typed_passes import BaseNativeLowering, NativeLowering
 from numba.np import arrayobj
 from numba.np.arrayobj import load_item, store_item
+
+from .held import FoldingBuilder, drop_unused, find_held
+from .shared import compiles_for_others
 
 _from_the_end = arrayobj.fix_integer_index
 
@@ -48,12 +51,25 @@ class OurLower(Lower):
     so such a one does count.  One that has no arrays but those, and their rows and blocks, counts nothing at all.
     """
 
-    def pre_lower(self) -> None:
-        super().pre_lower()
+    def init(self) -> None:
         self.module.factorbus = True
         self.module.factorbus_borrows = self._is_plain(self.fndesc.restype) and not any(
             self._is_owner(expression, signature) for expression, signature in self.fndesc.calltypes.items()
         )
+        super().init()
+
+    def setup_function(self, fndesc: Any) -> None:
+        super().setup_function(fndesc)
+        self.builder = FoldingBuilder(self.entry_block)
+        self.call_helper = self.call_conv.init_call_helper(self.builder)
+
+    def lower_normal_function(self, fndesc: Any) -> None:
+        super().lower_normal_function(fndesc)
+        drop_unused(self.function)
+
+    def _find_singly_assigned_variable(self) -> None:
+        super()._find_singly_assigned_variable()
+        self._singly_assigned_vars |= {name for name in find_held(self.blocks) if self._counts_nothing(name)}
 
     def _is_owner(self, expression: Any, signature: Any) -> bool:
         """Whether what it comes to may be, or have, an array of its own."""
@@ -61,6 +77,9 @@ class OurLower(Lower):
             return False
         looks_at = getattr(expression, "op", None) in {"getitem", "static_getitem"}
         return not looks_at or any(map(_has_array, signature.args[1:]))
+
+    def _counts_nothing(self, name: str) -> bool:
+        return self.module.factorbus_borrows or self._is_plain(self.typeof(name))
 
     def _is_plain(self, kind: Any) -> bool:
         """Whether there are no references to count in it."""
@@ -78,8 +97,15 @@ class OurLower(Lower):
 
     def delvar(self, name: str) -> None:
         """Nothing, where there is no reference to give up.  Numba loads what is not needed any more, and stores 0."""
-        if not (self.module.factorbus_borrows or self._is_plain(self.typeof(name))):
+        if not self._counts_nothing(name):
             super().delvar(name)
+
+    def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
+        """Without a look at what was there before, where it has no reference to give up."""
+        if name in self._singly_assigned_vars or not self._counts_nothing(name):
+            super().storevar(value, name, argidx)
+        else:
+            self.builder.store(value, self.getvar(name))
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
         place = self._place_of_number(value.name, index.name)
@@ -89,6 +115,10 @@ class OurLower(Lower):
         return self.context.cast(self.builder, load_item(self.context, self.builder, array, place), array.dtype, resty)
 
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
+        given, into = self.typeof(value_var.name), self.typeof(target_var.name)
+        if isinstance(into, types.Array) and isinstance(given, types.Array):
+            # Not a path that is missing: thirty functions of Numba's, to say of arrays of unlike sizes what they are.
+            raise NotImplementedError(f"{given}, assigned to a part of another array; a kernel copies number by number")
         place = self._place_of_number(target_var.name, index_var.name)
         if place is None:
             return super().lower_setitem(target_var, index_var, value_var, signature)
@@ -113,10 +143,10 @@ class OurLower(Lower):
             return None
         builder, model, value = self.builder, self.context.data_model_manager[array], self.loadvar(index)
         indices = [value] if kinds == (kind,) else cgutils.unpack_tuple(builder, value, len(kinds))
-        value = self.loadvar(name)
-        shape = cgutils.unpack_tuple(builder, model.get(builder, value, "shape"), array.ndim)
+        value, shape = self.loadvar(name), model.get_field_position("shape")
         place = None
-        for axis, (one, of, size) in enumerate(zip(indices, kinds, shape, strict=True)):
+        for axis, (one, of) in enumerate(zip(indices, kinds, strict=True)):
+            size = builder.extract_value(value, (shape, axis))
             number = self.context.cast(builder, one, of, types.intp)
             if getattr(of, "literal_value", 0) < 0 or (isinstance(one, ir.Constant) and one.constant < 0):
                 number = builder.add(size, number)
@@ -140,6 +170,15 @@ def _count_owned(self: Any, builder: Any, typ: Any, value: Any, funcname: str) -
         _count(self, builder, typ, value, funcname)
 
 
+_lower = BaseNativeLowering.run_pass
+
+
+def _lower_for_kernels(self: Any, state: Any) -> bool:
+    """Without what C would call it by, which nobody does in a process that compiles for others alone."""
+    state.flags.no_cfunc_wrapper = True
+    return _lower(self, state)
+
+
 _find_call_type = types.BaseFunction.get_call_type
 _call_types: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by the identity of the function, which is kept with them
 
@@ -161,14 +200,17 @@ _EXCHANGED = (
     (NRTContext, "_call_incref_decref", _count_owned),
     (types.BaseFunction, "get_call_type", _known_call_type),
 )
+# In a process where Numba keeps nothing for others: all that it compiles is for kernels.
+_EXCHANGED_APART = (*_EXCHANGED, (BaseNativeLowering, "run_pass", _lower_for_kernels))
 
 
 @contextmanager
 def changed_numba() -> Iterator[None]:
     """Numba with our functions in place of its own, which are back afterwards.  For who holds the compiler's lock."""
-    found = [(owner, name, getattr(owner, name)) for owner, name, _ in _EXCHANGED]
+    exchanged = _EXCHANGED_APART if compiles_for_others() else _EXCHANGED
+    found = [(owner, name, getattr(owner, name)) for owner, name, _ in exchanged]
     try:
-        for owner, name, ours in _EXCHANGED:
+        for owner, name, ours in exchanged:
             setattr(owner, name, ours)
         yield
     finally:

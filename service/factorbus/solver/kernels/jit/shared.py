@@ -14,7 +14,7 @@ import llvmlite.binding
 from numba.core.funcdesc import ExternalFunctionDescriptor
 from numba.core.typing.templates import make_concrete_template
 
-__all__ = ["SharedKernel", "only_compile"]
+__all__ = ["SharedKernel", "compiles_for_others", "only_compile"]
 
 _nowhere: list[int] = []
 
@@ -22,6 +22,11 @@ _nowhere: list[int] = []
 def only_compile() -> None:
     """This process runs no kernel from here on: those that are called by their address need not be there."""
     _nowhere[:] = [ctypes.cast(ctypes.CDLL(None).abort, ctypes.c_void_p).value or 0]
+
+
+def compiles_for_others() -> bool:
+    """Whether this process runs no kernel."""
+    return bool(_nowhere)
 
 
 class SharedKernel:

@@ -54,7 +54,8 @@ def write_expansion(form: ImuLayout, z: F64) -> None:
     """Write it behind the samples of the measurement that begins at z[0]."""
     room, bias, k = make_room(), z[form.bias_at : form.bias_at + of.BIAS].copy(), expansion_at(form)
     preintegrate(form, z, bias, room, True)
-    z[k : k + of.DELTA] = room[of.BIAS :]
+    for c in range(of.DELTA):
+        z[k + c] = room[of.BIAS + c]
     step, is_seen = _STEP / z[k], True
     for g in range(3):
         shifted, off = make_room(), bias.copy()
