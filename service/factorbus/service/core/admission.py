@@ -104,6 +104,12 @@ class Admission:
         client = self._clients.get(name)
         return client.next if client is not None else 1
 
+    def check_numbers(self, inserts: Iterable[tuple[str, int]]) -> None:
+        """Raises BadSequence where one of (client, number) is used up."""
+        for client, sequence in inserts:
+            if sequence < (wanted := self.wanted(client)):
+                raise BadSequence(client, sequence, f"{wanted} or more of that client", wanted)
+
     def take_alone(self, arrived: Arrived) -> bool:
         """Take the insert, if it is next, and nothing else waits here or is parked; if not, `admit` it."""
         client = self._clients.get(arrived.client)

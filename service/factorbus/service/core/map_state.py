@@ -15,13 +15,28 @@ from dataclasses import replace
 from typing import Any
 
 from factorbus.proto import codec
-from factorbus.proto.problems import BadSequence, Busy, Problem, ShuttingDown, UnknownMap
+from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core.admission import Admission
 from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
-    Applied, Arrived, ArrivedQuestion, Asker, Drained, Effect, Follow, InsertBatch, ParsedInsert, Publish, Read,
-    Refuse, Restored, SingleInsertResult, Stepped, Tell, Verdict,
+    Applied,
+    Arrived,
+    ArrivedQuestion,
+    Asker,
+    Drained,
+    Effect,
+    Follow,
+    InsertBatch,
+    ParsedInsert,
+    Publish,
+    Read,
+    Refuse,
+    Restored,
+    SingleInsertResult,
+    Stepped,
+    Tell,
+    Verdict,
 )  # fmt: skip
 from factorbus.service.core.pending_questions import Reads, is_graft
 from factorbus.service.core.statistics import InsertDone, MapStatistics
@@ -45,6 +60,7 @@ class MapCore:
         self.differs: str | None = None  # as `Restored` has it
         self._limits, self._created = limits, now
         self._admission = Admission(epoch, limits)
+        self.check_numbers = self._admission.check_numbers
         self._reads = Reads()
         self._running: InsertBatch | None = None
         self._unanswered = self._unanswered_bytes = 0  # given to the solver, and not answered
@@ -201,12 +217,6 @@ class MapCore:
             self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2)
             self._moved_at = stepped.revision
         return [Publish("delta", stepped.delta)]
-
-    def check_numbers(self, inserts: Iterable[tuple[str, int]]) -> None:
-        """Raises BadSequence where one of (client, number) is used up."""
-        for client, sequence in inserts:
-            if sequence < (wanted := self._admission.wanted(client)):
-                raise BadSequence(client, sequence, f"{wanted} or more of that client", wanted)
 
     def grafted(
         self, inserts: Iterable[tuple[str, int, int, object]], steps: Iterable[Stepped], now: float

@@ -316,11 +316,8 @@ class Host:
         try:
             if self._keeping is None:
                 raise NotRecorded(self.core.name)
-            if graft.upstream_place is None:
-                with self._lock:
-                    self.core.check_numbers((i.client, i.sequence) for r in graft.records for i in r.inserts)
-            reload = self._keeping.reload
-            done = graft_records(self.core.name, graft, self._map_solver, keeper, reload)
+            reload, check = self._keeping.reload, self._check_numbers
+            done = graft_records(self.core.name, graft, self._map_solver, keeper, reload, check)
         except (Problem, SolverError) as problem:
             self._refuse([read], problem)
             return
@@ -341,6 +338,10 @@ class Host:
         place = JournalPlace(done.last.record, done.last.chain)
         answer = RecordsAnswer(self.core.epoch, place, same=done.same_outcomes)
         self._do([Answer(read.asker, encode_records_answer(answer))])
+
+    def _check_numbers(self, inserts: Iterable[tuple[str, int]]) -> None:
+        with self._lock:
+            self.core.check_numbers(inserts)
 
     def _read(self, reads: Sequence[Read]) -> None:
         try:

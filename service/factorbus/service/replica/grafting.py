@@ -73,9 +73,15 @@ class Grafted(NamedTuple):
 
 
 def graft_records(
-    name: str, graft: Graft, map_solver: MapSolver, keeper: Keeper, reload: Callable[[MapSolver], Last]
+    name: str,
+    graft: Graft,
+    map_solver: MapSolver,
+    keeper: Keeper,
+    reload: Callable[[MapSolver], Last],
+    check: Callable[[Iterable[tuple[str, int]]], None],
 ) -> Grafted:
-    """Do what `graft` asks for.  reload: brings the map back to where the journal ends.
+    """Do what `graft` asks for.  reload: brings the map back to where the journal ends.  check: raises Problem where
+    one of the inserts (client, number) of a replica is used up.
 
     Raises Problem: then nothing has changed.
     """
@@ -86,6 +92,7 @@ def graft_records(
             raise RecordsMovedOn(name, last.record, after)
         if not graft.records:
             return Grafted(last)
+        check((insert.client, insert.sequence) for record in graft.records for insert in record.inserts)
         return _kept(_Grafting(name, map_solver, last, False), graft, (), keeper, reload)
     store = open_store(keeper.folder, read_only=True)
     try:
