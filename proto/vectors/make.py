@@ -42,6 +42,17 @@ from factorbus.proto.messages import (
     Variables,
 )
 from factorbus.proto.problems import Busy
+from factorbus.proto.records import (
+    JournalPlace,
+    RecordsAnswer,
+    RecordsAsk,
+    RecordsPush,
+    SentInsert,
+    SentRecord,
+    encode_records_answer,
+    encode_records_ask,
+    encode_records_push,
+)
 from factorbus.proto.similarity_kinds import SIMILARITY_KINDS
 from factorbus.proto.symbols import symbol
 
@@ -56,6 +67,8 @@ _COLUMNS |= dict.fromkeys(("plausible", "matched"), "u8")
 _COLUMNS |= {"factors": "i64", "ids": "i64", "weight": "f64"}
 # Of variables, §4, and interests, §18.
 _COLUMNS |= {"stamps": "i64", "box": "f64"}
+# Of replicas, §19.
+_COLUMNS |= {"chain": "u8", "records": "u8", "zlib": "u8", "named": "i64"}
 _CUTS = (slice(None, -1), slice(-1, None))
 
 
@@ -73,6 +86,7 @@ def vectors() -> dict[str, bytes]:
     kitchen = _KITCHEN["messages"]()
     return {
         **kitchen,
+        **_records(17),
         **_interests(codec.decode_estimate(kitchen["estimate"])),
         **{
             f"kinds/{name}": codec.encode_insert(Insert(1, _one_of(kind), epoch=7))
@@ -138,6 +152,22 @@ def _interests(estimate: Estimate) -> dict[str, bytes]:
             InterestDelta(epoch, revision, revision, 4711, 14, gone=left, waiting=3)
         ),
         "ask_part": codec.encode_map(filter_map(interest)),
+    }
+
+
+def _records(epoch: int) -> dict[str, bytes]:
+    """A question for records, an answer, and what a replica sends; small, so that nothing is compressed."""
+    place, later = JournalPlace(3, bytes(range(16))), JournalPlace(5, bytes(range(16, 32)))
+    told = codec.encode_problem(Busy(1, 0.1))
+    taken = SentRecord(4, (SentInsert("robot1-5f", 2, b"\x80", 0), SentInsert("r2", 1, b"", 4711)))
+    refused = SentRecord(4, (SentInsert("r2", 2, b"\x80", 0, 1, told),))
+    return {
+        "ask_records": encode_records_ask(RecordsAsk(JournalPlace())),
+        "ask_records_named": encode_records_ask(RecordsAsk(place, (4711, 12), 4096)),
+        "records_answer": encode_records_answer(RecordsAnswer(epoch, later, (taken,), more=True)),
+        "records_answer_none": encode_records_answer(RecordsAnswer(epoch, place, same=False)),
+        "records_push": encode_records_push(RecordsPush(place, (SentRecord(5, (), further=True),))),
+        "records_push_refused": encode_records_push(RecordsPush(place, (refused,))),
     }
 
 
@@ -355,7 +385,7 @@ def _plain(content: Any, name: str = "") -> Any:
     if isinstance(content, dict):
         return {key: _plain(value, key) for key, value in content.items()}
     if isinstance(content, list):
-        return [_plain(item) for item in content]
+        return [_plain(item, name) for item in content]
     if isinstance(content, bytes):
         if name not in _COLUMNS:
             return {"msgpack": _plain(msgpack.unpackb(content))}
