@@ -1,4 +1,4 @@
-"""A replica on a robot: the link is cut, slow or lossy, either end is killed; nothing is lost, nothing is there twice."""
+"""A replica on a robot: the link is cut, slow or lossy, either end is killed; nothing is lost, nothing twice."""
 
 import signal
 import time
@@ -93,7 +93,7 @@ def test_it_follows_what_others_write_upstream(pair: Pair) -> None:
                 draft = Draft().se2(f"{letter}{n}", (0, 0, 0) if n == 0 else None, fixed=n == 0)
                 if n:
                     draft.between_se2(f"{letter}{n - 1}", f"{letter}{n}", (1, 0, 0.1), sigmas=SIGMAS)
-                each.add(draft)
+                each.insert(draft)
         pair.link.relay.break_all()
         pair.link.relay.release()
         wait_until_level(driven, at_base, 60)
@@ -117,8 +117,8 @@ def test_loss_and_delay_between_two_namespaces(spawn: Callable[..., Process], tm
         )
         base.ready()
         robot = spawn(
-            *wire.run("client"), *listen, f"tcp/{CLIENT}:7448", "--journal", str(tmp_path / "robot"), "--name", "robot1",
-            "--create", MAP, "--upstream", f"tcp/{SERVICE}:7447",
+            *wire.run("client"), *listen, f"tcp/{CLIENT}:7448", "--journal", str(tmp_path / "robot"),
+            "--name", "robot1", "--upstream", f"tcp/{SERVICE}:7447",
         )  # fmt: skip
         robot.ready()
         client = spawn(*wire.run("client"), STREAMER, f"tcp/{CLIENT}:7448", MAP, str(poses))

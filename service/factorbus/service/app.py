@@ -151,8 +151,6 @@ class Shell:
         if library is not None:
             self.health_report.chapters["disk"] = library.disk
         self._replicas = _follow(config, self._service, self.maps) if config.upstream else None
-        if self._replicas is not None:
-            self.health_report.chapters["upstream"] = self._replicas.rows
         self._worker_rows: list[dict[str, Any]] = []
         self.health_report.chapters["workers"] = lambda: self._worker_rows
         self._records = RecordServing(

@@ -124,14 +124,10 @@ class Replicas:
             self._ticking = True
             self._events.put(self._tick)
 
-    def rows(self) -> list[dict[str, Any]]:
-        """What admin/stats says: of every map, how it follows."""
-        return [self._row(name, followed) for name, followed in list(self._maps.items())]
-
     def row(self, name: str) -> dict[str, Any]:
         """What ask/stats of map `name` says, if it follows."""
         followed = self._maps.get(name)
-        return {} if followed is None else {"upstream": self._row(name, followed)}
+        return {} if followed is None else {"upstream": self._row(followed)}
 
     def close(self) -> None:
         """Follow no more."""
@@ -140,10 +136,9 @@ class Replicas:
         if self._session is not None:
             self._session.close()
 
-    def _row(self, name: str, followed: _Followed) -> dict[str, Any]:
+    def _row(self, followed: _Followed) -> dict[str, Any]:
         core, problem = followed.core, followed.core.problem
         return {
-            "map": name,
             "endpoint": self._endpoint,
             "connected": core.connected,
             "since_s": time.monotonic() - core.since,
