@@ -19,6 +19,7 @@ from factorbus.proto.codec import decode_map, encode_map
 from factorbus.proto.keys import is_name
 from factorbus.proto.limits import ANSWER_LIMITS, MessageLimits
 from factorbus.proto.problems import BadMessage, TooLarge
+from factorbus.wording import counted
 
 START_CHAIN = bytes(16)  # before the first record
 MOST_RECORDS, MOST_NAMED = 256, 4096  # in one message; inserts that an asker may name
@@ -118,7 +119,9 @@ def decode_records_ask(data: bytes, limits: MessageLimits) -> RecordsAsk:
     content = decode_map(data, limits, "records")
     named = fields.binary("records", content, "named") if content.get("named") is not None else b""
     if len(named) % 8 or len(named) > 8 * MOST_NAMED:
-        raise BadMessage("records.named", f"has {len(named)} bytes", f"8 for each digest, at most {8 * MOST_NAMED}")
+        raise BadMessage(
+            "records.named", f"has {counted(len(named), 'byte')}", f"8 for each digest, at most {8 * MOST_NAMED}"
+        )
     most_bytes = fields.integer("records", content, "most_bytes", 1, MOST_BYTES)
     digests = tuple(np.frombuffer(named, fields.I8).tolist())
     return RecordsAsk(_place("records", content), digests, min(most_bytes, MOST_BYTES))
@@ -154,7 +157,7 @@ def _place_map(place: JournalPlace) -> dict[str, Any]:
 def _place(where: str, content: fields.Map) -> JournalPlace:
     chain = fields.binary(where, content, "chain")
     if len(chain) != len(START_CHAIN):
-        raise BadMessage(f"{where}.chain", f"has {len(chain)} bytes", f"{len(START_CHAIN)}")
+        raise BadMessage(f"{where}.chain", f"has {counted(len(chain), 'byte')}", f"{len(START_CHAIN)}")
     return JournalPlace(fields.integer(where, content, "record"), chain)
 
 
