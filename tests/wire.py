@@ -98,7 +98,7 @@ class Relay:
 
     def __init__(self, port: int) -> None:
         self._to = port
-        self.delay_s = 0.0
+        self.delay_s, self.carried_bytes = 0.0, 0
         self._open = threading.Event()
         self._open.set()
         self._pairs: list[tuple[socket.socket, socket.socket]] = []
@@ -167,6 +167,7 @@ class Relay:
                     time.sleep(self.delay_s)  # what it is for
                 self._open.wait()
                 sink.sendall(data)
+                self.carried_bytes += len(data)
         for each in (source, sink):
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)

@@ -42,6 +42,16 @@ from factorbus.proto.messages import (
     Variables,
 )
 from factorbus.proto.problems import Busy
+from factorbus.proto.records import (
+    JournalPlace,
+    RecordsAnswer,
+    RecordsAsk,
+    RecordsPush,
+    SentRecord,
+    encode_records_answer,
+    encode_records_ask,
+    encode_records_push,
+)
 from factorbus.proto.similarity_kinds import SIMILARITY_KINDS
 from factorbus.proto.symbols import symbol
 
@@ -56,6 +66,8 @@ _COLUMNS |= dict.fromkeys(("plausible", "matched"), "u8")
 _COLUMNS |= {"factors": "i64", "ids": "i64", "weight": "f64"}
 # Of variables, §4, and interests, §18.
 _COLUMNS |= {"stamps": "i64", "box": "f64"}
+# Of replicas, §19.
+_COLUMNS |= {"chain": "u8", "named": "i64"}
 _CUTS = (slice(None, -1), slice(-1, None))
 
 
@@ -73,6 +85,7 @@ def vectors() -> dict[str, bytes]:
     kitchen = _KITCHEN["messages"]()
     return {
         **kitchen,
+        **_records(17),
         **_interests(codec.decode_estimate(kitchen["estimate"])),
         **{
             f"kinds/{name}": codec.encode_insert(Insert(1, _one_of(kind), epoch=7))
@@ -138,6 +151,17 @@ def _interests(estimate: Estimate) -> dict[str, bytes]:
             InterestDelta(epoch, revision, revision, 4711, 14, gone=left, waiting=3)
         ),
         "ask_part": codec.encode_map(filter_map(interest)),
+    }
+
+
+def _records(epoch: int) -> dict[str, bytes]:
+    """Questions for records, an answer that has none, and a further step that a replica sends."""
+    place = JournalPlace(3, bytes(range(16)))
+    return {
+        "ask_records": encode_records_ask(RecordsAsk(JournalPlace())),
+        "ask_records_named": encode_records_ask(RecordsAsk(place, (4711, 12), 4096)),
+        "records_answer_none": encode_records_answer(RecordsAnswer(epoch, place, same=False)),
+        "records_push": encode_records_push(RecordsPush(place, (SentRecord(5, (), further=True),))),
     }
 
 

@@ -43,6 +43,8 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
         ("[limits]\nwaiting = true", "wanted a whole number"),
         ('mode = "hub"', "wanted peer, router or client"),
         ('mode = "client"', "nothing to connect to"),
+        ('upstream = "tcp/base:7447"', "upstream without a journal"),
+        ('upstream_zenoh = "robot.json5"', "without an upstream"),
         ("listen = []", "nothing to listen on"),
         ('maps = "a/*"', "wanted a map name"),
         ("job_deadline_s = -1", "wanted more than 0"),

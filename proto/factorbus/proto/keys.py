@@ -4,6 +4,7 @@
     factorbus/v1/map/<map>/ask/<question>               query        estimate, chi2, graph, ...: QUESTIONS
     factorbus/v1/map/<map>/out/{delta,snapshot,event}   publication
     factorbus/v1/map/<map>/out/interest-<id>            publication  of one interest
+    factorbus/v1/map/<map>/records/<replica>            query        records of a replica's journal
     factorbus/v1/map/<map>/live/{service,client}/<id>   liveliness token
     factorbus/v1/worker/<id>/job                        query
     factorbus/v1/worker/<id>/live/<slots>               liveliness token
@@ -24,7 +25,7 @@ PREFIX = f"factorbus/{VERSION}"
 ANY_SERVICE_OF_ANY_VERSION = "factorbus/*/features/*/live"
 QUESTIONS = (
     "estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why", "repair",
-    "interest",
+    "interest", "records",
 )  # fmt: skip
 LONGEST_NAME = 64
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -70,6 +71,11 @@ def ask_key(map_name: str, question: str) -> str:
 def any_question(map_name: str) -> str:
     """What the owner of a map answers questions on."""
     return f"{map_root(map_name)}/ask/*"
+
+
+def records_key(map_name: str, replica: str) -> str:
+    """Where `replica` sends the records of its journal.  Raises BadName."""
+    return f"{map_root(map_name)}/records/{checked_name('replica', replica)}"
 
 
 def delta_key(map_name: str) -> str:

@@ -86,3 +86,24 @@ class Sender:
     client: str
     next: int
     entries: tuple[Entry, ...] = field(default=())
+
+
+class Checkpoint(NamedTuple):
+    """A checkpoint that was written: after which record, in which format of a state, by which build, how large.
+
+    differs: why a replay of the journal up to there may give other bits; empty: as far as is known it gives the same.
+    """
+
+    record: int
+    format: int
+    build: Mapping[str, str]
+    differs: str = ""
+    bytes: int = 0
+
+
+class Last(NamedTuple):
+    """Where a journal ends."""
+
+    record: int
+    revision: int
+    chain: bytes

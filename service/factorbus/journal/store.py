@@ -1,7 +1,6 @@
 """A journal's database: what is in its tables, and how it is written.
 
-Written by one process, and read by others at the same time (WAL).  One transaction takes in all records that wait for
-it (group commit); it is there after a crash wholly or not at all.
+Written by one process, and read by others at the same time (WAL); one transaction takes in all records that wait.
 """
 
 import json
@@ -12,7 +11,7 @@ from contextlib import contextmanager
 from hashlib import blake2b
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from factorbus.journal import chain
 from factorbus.journal.connecting import APPLICATION, FORM, connected, connection_to, what_reading_failed_with
@@ -20,7 +19,7 @@ from factorbus.journal.digest import digest_of
 from factorbus.journal.faults import list_faults
 from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_folder
 from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal, NotWritten
-from factorbus.journal.records import Entry, Epoch, Header, JournalRecord, Maker, Sender
+from factorbus.journal.records import Checkpoint, Entry, Epoch, Header, JournalRecord, Last, Maker, Sender
 from factorbus.ownership import private_file
 
 NAME = "journal.db"
@@ -45,27 +44,6 @@ CREATE TABLE maker (record INTEGER PRIMARY KEY, build TEXT NOT NULL);
 """
 _REBUILT, _FURTHER = 1, 2
 _ENTRY = "client, sequence, digest, outcome, revision, first_factor, together, answer"
-
-
-class Checkpoint(NamedTuple):
-    """A checkpoint that was written: after which record, in which format of a state, by which build, how large.
-
-    differs: why a replay of the journal up to there may give other bits; empty: as far as is known it gives the same.
-    """
-
-    record: int
-    format: int
-    build: Mapping[str, str]
-    differs: str = ""
-    bytes: int = 0
-
-
-class Last(NamedTuple):
-    """Where a journal ends."""
-
-    record: int
-    revision: int
-    chain: bytes
 
 
 class Store:
@@ -159,20 +137,17 @@ class Store:
     def append(self, records: Sequence[JournalRecord]) -> None:
         """Write `records` down: when this returns they are as safe as the durability says.  Raises JournalFailed."""
         with self._writing():
-            self._db.executemany(
-                "INSERT INTO record VALUES (?, ?, ?, ?)", [(f.number, f.revision, _kind(f), f.chain) for f in records]
-            )
-            self._db.executemany(
-                f"INSERT INTO entry (record, {_ENTRY}, message) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                [(record.number, *entry) for record in records for entry in record.entries],
-            )
+            self._insert_records(records)
 
-    def add_checkpoint(self, saved: Checkpoint, keep: int) -> list[int]:
-        """Note a checkpoint, and forget all but the last `keep`: gives the records of those.  Raises JournalFailed."""
+    def add_checkpoint(self, saved: Checkpoint, keep: int, back_to: int = 0) -> list[int]:
+        """Note a checkpoint, and forget all but the last `keep` and the last up to record `back_to`: gives the records
+        of those that are forgotten.  Raises JournalFailed."""
+        held = "SELECT COALESCE(MAX(record), 0) FROM checkpoint WHERE record <= ?"
         with self._writing():
             self._insert_checkpoint(saved)
             old = self._db.execute(
-                "SELECT record FROM checkpoint ORDER BY record DESC LIMIT -1 OFFSET ?", (keep,)
+                f"SELECT record FROM checkpoint WHERE record <> ({held}) ORDER BY record DESC LIMIT -1 OFFSET ?",
+                (back_to, keep),
             ).fetchall()
             self._db.executemany("DELETE FROM checkpoint WHERE record = ?", old)
         return [record for (record,) in old]
@@ -186,7 +161,7 @@ class Store:
             self._set({"clean": "0", "durability": durability})
             self._db.execute("DELETE FROM maker WHERE record > (SELECT COALESCE(MAX(number), 0) FROM record)")
             if maker is not None:
-                self._db.execute("INSERT INTO maker VALUES (?, ?)", (maker.record, _text(maker.build)))
+                self._db.execute("INSERT INTO maker VALUES (?, ?)", (maker.record, text_of_build(maker.build)))
             if epoch is not None:
                 self._add_epoch(epoch)
                 self._seal()
@@ -300,8 +275,16 @@ class Store:
             "INSERT INTO epoch (epoch, record, because) VALUES (?, ?, ?)", (epoch.epoch, epoch.record, epoch.because)
         )
 
+    def _insert_records(self, records: Sequence[JournalRecord]) -> None:
+        rows = [(record.number, record.revision, _kind(record), record.chain) for record in records]
+        self._db.executemany("INSERT INTO record VALUES (?, ?, ?, ?)", rows)
+        self._db.executemany(
+            f"INSERT INTO entry (record, {_ENTRY}, message) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [(record.number, *entry) for record in records for entry in record.entries],
+        )
+
     def _insert_checkpoint(self, saved: Checkpoint) -> None:
-        row = saved.record, saved.format, _text(saved.build), saved.differs, saved.bytes
+        row = saved.record, saved.format, text_of_build(saved.build), saved.differs, saved.bytes
         self._db.execute("INSERT OR REPLACE INTO checkpoint VALUES (?, ?, ?, ?, ?)", row)
 
     def _checked(self, entry: Entry) -> Entry:
@@ -378,7 +361,8 @@ def _kind(record: JournalRecord) -> int:
     return _FURTHER if record.further else _REBUILT * record.rebuilt
 
 
-def _text(build: Mapping[str, str]) -> str:
+def text_of_build(build: Mapping[str, str]) -> str:
+    """As the tables have it."""
     return json.dumps(dict(build), ensure_ascii=False)
 
 

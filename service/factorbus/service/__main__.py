@@ -45,6 +45,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--journal", metavar="DIR", help="keep maps here, across restarts and crashes")
     parser.add_argument("--durability", choices=DURABILITIES, help="what an answer promises: see service/README.md")
     parser.add_argument("--standby", action="store_true", help="wait until the journal's owner is gone, and take over")
+    parser.add_argument("--upstream", metavar="ENDPOINT", help="be a replica of the service there")
+    parser.add_argument("--upstream-zenoh", metavar="FILE", help="Zenoh configuration of the session with it")
     parser.add_argument("--no-warm", action="store_true", help="compile kernels when they are first used")
     return parser
 
@@ -52,7 +54,19 @@ def _parser() -> argparse.ArgumentParser:
 def _config(options: argparse.Namespace) -> Config:
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
-        for name in ("listen", "connect", "mode", "name", "maps", "create", "zenoh", "journal", "durability")
+        for name in (
+            "listen",
+            "connect",
+            "mode",
+            "name",
+            "maps",
+            "create",
+            "zenoh",
+            "journal",
+            "durability",
+            "upstream",
+            "upstream_zenoh",
+        )
         if (value := getattr(options, name)) is not None
     }
     if options.no_warm:

@@ -9,6 +9,7 @@ threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand o
           answers 0..3     answers to questions, which can be large
           computed 0, 1    answers to questions that take long to compute: covariances of many, repair, files
           in-place <kind>  jobs when there is no worker
+          records          answers replicas; upstream: follows the service that this one is a replica of
           interests        filters what changed for those who follow a part of a map, and sends it
           features         questions of filters: small ones done, large ones cut up and put together
           core 1..         worker threads of eliminations that take long
@@ -33,9 +34,11 @@ from factorbus.service.bus.delivery import Delivery
 from factorbus.service.bus.senders import Senders
 from factorbus.service.bus.zenoh_session import (
     ServiceBus,
+    UpstreamBus,
     ignore,
     key_of,
     open_service_bus,
+    open_upstream_bus,
     payload_of,
     received,
     refuse,
@@ -59,6 +62,8 @@ from factorbus.service.questions.admin import NotHere, read_create, read_drop, r
 from factorbus.service.questions.answers import Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.registry import Maps
+from factorbus.service.replica.running import Replicas
+from factorbus.service.replica.serving import RecordServing
 from factorbus.service.solving.arrival import read_insert
 from factorbus.solver.graph.own_kinds import bytes_to_compile
 
@@ -145,8 +150,12 @@ class Shell:
         self.health_report.chapters["unopened"] = self.maps.unopened
         if library is not None:
             self.health_report.chapters["disk"] = library.disk
+        self._replicas = _follow(config, self._service, self.maps) if config.upstream else None
         self._worker_rows: list[dict[str, Any]] = []
         self.health_report.chapters["workers"] = lambda: self._worker_rows
+        self._records = RecordServing(
+            config.limits, self._delivery.answer, self._delivery.refuse, self.health_report.memory.no_room
+        )
         self._stuck: set[str] = set()
         self._jobs = Jobs(self._control, bus.send_job)
         self.health_report.chapters["wrong_answers"] = lambda: self._jobs.wrong_answers
@@ -176,6 +185,7 @@ class Shell:
         self.maps.open_kept()
         bus.answer_on(f"{root}/in/*", self._on_insert)
         bus.answer_on(f"{root}/ask/*", self._on_question)
+        bus.answer_on(f"{root}/records/*", self._on_records)
         bus.answer_on(keys.admin_key("*"), self._on_admin)
         bus.answer_on(keys.features_key(self._service), self._on_features)
         bus.watch(keys.any_worker_token(), self._on_worker)
@@ -187,6 +197,8 @@ class Shell:
         """Time went by."""
         for host in self.maps.hosts().values():
             host.tick()
+        if self._replicas is not None:
+            self._replicas.tick()
         stuck = self.health_report.look()
         if stuck != self._stuck:
             self._control.hand(self.maps.show, stuck ^ self._stuck, stuck)
@@ -198,6 +210,9 @@ class Shell:
         """Withdraw, finish everything accepted, answer it, and undeclare."""
         self.health_report.health.open = False
         self._withdraw_features()
+        if self._replicas is not None:
+            self._replicas.close()
+        self._records.close()
         self.maps.finish()
         self._delivery.settle()
         self._features.stop()
@@ -238,8 +253,18 @@ class Shell:
         found = self.maps.get(name)
         if found is None:
             self._delivery.refusals.hand(self._no_map, query, name, self._on_question)
+        elif question == "records":
+            self._records.ask(query, found.host, payload_of(query))
         else:
             found.host.ask(ArrivedQuestion(query, question, payload_of(query)))
+
+    def _on_records(self, query: Asker) -> None:
+        name, _ = _chunks(query)
+        found = self.maps.get(name)
+        if found is None:
+            self._delivery.refusals.hand(self._no_map, query, name, self._on_records)
+        else:
+            self._records.take(query, found.host, payload_of(query))
 
     def _on_admin(self, query: Asker) -> None:
         if (waiting := self._control.waiting) < _ADMIN_WAITING:
@@ -358,6 +383,13 @@ class Shell:
                 f"{others[0]} is alive: another service keeps maps named {self._config.maps}; "
                 "give each service a pattern of its own with maps ="
             )
+
+
+def _follow(config: Config, service: str, maps: Maps) -> Replicas:
+    def open_session(see: Callable[[bool], None]) -> UpstreamBus:
+        return open_upstream_bus(config.upstream, config.upstream_zenoh, see)
+
+    return Replicas(config.upstream, service, maps.hosts, open_session)
 
 
 def _chunks(query: Asker) -> tuple[str, str]:

@@ -93,6 +93,8 @@ class Config:
     cores: int = 2  # that one elimination may be at work on at once, of those that there are
     # From so much memory of a map on; before, each on its own thread alone.  10,000 poses in a plane, 2,000 in space.
     cores_from_bytes: int = 64 << 20
+    upstream: str = ""  # endpoint of the service that has the same maps, which this one follows; empty: nobody
+    upstream_zenoh: str = ""  # path of a Zenoh configuration file for the session with it (TLS, user)
     standby: bool = False  # wait until the process that owns the journal's folder is gone
     limits: Limits = field(default_factory=Limits)
 
@@ -109,7 +111,7 @@ def load_config(path: str | Path, **overrides: Any) -> Config:
 
 def checked_config(config: Config) -> Config:
     """`config`, if it can work.  Raises BadConfig, BadEndpoint, BadName."""
-    for endpoint in (*config.listen, *config.connect):
+    for endpoint in (*config.listen, *config.connect, *([config.upstream] if config.upstream else ())):
         checked_endpoint(endpoint)
     for name in config.create:
         checked_name("map", name)
@@ -136,6 +138,10 @@ def checked_config(config: Config) -> Config:
         raise BadConfig(f"durability is {config.durability!r}; wanted {', '.join(DURABILITIES)}")
     if config.standby and not config.journal:
         raise BadConfig("standby without a journal: there is nothing to take over; give journal = DIR")
+    if config.upstream and not config.journal:
+        raise BadConfig("upstream without a journal: what upstream does not have yet is kept in it; give journal = DIR")
+    if config.upstream_zenoh and not config.upstream:
+        raise BadConfig('upstream_zenoh without an upstream; give upstream = "tcp/HOST:7447"')
     usual = Config()
     for name in ("durability", "group_s", "checkpoint_s"):
         if getattr(config, name) != getattr(usual, name) and not config.journal:

@@ -39,6 +39,10 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
     type=click.Choice(("none", "group", "commit")),
     help="With a journal: what an answer promises (see below).  [default: commit]",
 )
+@click.option(
+    "--upstream", metavar="ENDPOINT", help="Be a replica of the service there, and go on without it (see below)."
+)
+@click.option("--upstream-zenoh", metavar="FILE.json5", help="Zenoh configuration for it: TLS, user (deploy/zenoh).")
 @click.option("--standby", is_flag=True, default=None, help="Wait until the journal's owner is gone, and take over.")
 @click.option("--name", metavar="NAME", help="Of this service, as the bus sees it.  [default: made up]")
 @click.option("--warm/--no-warm", default=None, help="Compile every kernel before the first insert.  [default: warm]")
@@ -60,6 +64,11 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
     factorbus serve --listen tls/0.0.0.0:7447 --zenoh service.json5 --map warehouse
     factorbus serve --journal /var/lib/factorbus
     factorbus serve --config /etc/factorbus/serve.toml
+    factorbus serve --journal /var/lib/factorbus --map yard --upstream tcp/base:7447 --name robot1
+
+    With --upstream, on a robot: clients here insert and ask as anywhere, and never wait for the link. What they insert
+    goes upstream under their names and numbers, and what others write there comes here, in upstream's order. While the
+    link is down it waits in the journal. Every map here is one of the same name upstream.
 
     \b
     With --journal, when an insert is answered:

@@ -69,12 +69,21 @@ def _rows(service: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "workers", told or "none: jobs are done in place"
     for row in service["maps"]:
         yield f"map {row['name']}", _map(row)
+        if follows := row.get("upstream"):
+            yield f"map {row['name']} follows", _upstream(follows)
     for row in service.get("interests", ()):
         yield f"interest in {row['map']}", interest_line(row)
     for row in service.get("unopened", ()):
         yield f"map {row['name']}", f"does not open ({row['state']}): {row['problem']}"
     for name, value in shown_fields(service.get("journal", {})):
         yield f"journal {name}", value
+
+
+def _upstream(row: Mapping[str, Any]) -> str:
+    link = f"{'connected' if row['connected'] else 'out of reach'} for {_span(row['since_s'])}"
+    told = f"{row['endpoint']}, {link}, behind by {counted(row['behind'], 'insert')}"
+    told += f", rebased {counted(row['rebased'], 'time')}" if row["rebased"] else ""
+    return told + (f": {row['problem']}" if row["problem"] else "")
 
 
 def _map(row: Mapping[str, Any]) -> str:

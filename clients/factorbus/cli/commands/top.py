@@ -90,14 +90,15 @@ def view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType":
     closed = [Text(f"map {line}", style="bold red") for line in seen["unopened"]]
     tables = (_table(console, rows) for rows in (_maps(seen), _clients(seen)))
     interests = [_table(console, _interests(seen))] if seen["interests"] else []
+    upstreams = [_table(console, rows)] if (rows := _upstreams(seen))[1] else []
     workers = _table(console, _workers(seen))
-    return Group(Text(head, style="bold"), Text(), *closed, *tables, *_gone(seen), *interests, workers)
+    return Group(Text(head, style="bold"), Text(), *closed, *tables, *_gone(seen), *upstreams, *interests, workers)
 
 
 # Columns of each table, the first of which stays; where not all have room the last of these goes first.
 _MATTER = (
     "variables", "revision", "χ²", "step ms", "waiting", "steps/s", "factors", "inserts", "map", "inserts/s", "refused",
-    "mode", "slots", "in flight", "latency ms", "bytes/s", "at most",
+    "mode", "slots", "in flight", "latency ms", "bytes/s", "at most", "upstream", "rebased", "link", "behind",
 )  # fmt: skip
 _ANY_WIDTH = 10_000
 _LEFT = ("map", "mode")
@@ -166,6 +167,22 @@ def _interests(seen: dict[str, Any]) -> _Table:
         for row in seen["interests"]
     ]
     return ("interest", "map", "bytes/s", "at most", "waiting"), rows
+
+
+def _upstreams(seen: dict[str, Any]) -> _Table:
+    """Of a replica: which maps follow whom, and how far behind upstream is."""
+    found = [(row["name"], row["upstream"]) for row in seen["maps"] if row.get("upstream")]
+    rows = [
+        (
+            name,
+            row["endpoint"],
+            f"{'connected' if row['connected'] else 'out of reach'} for {row['since_s']:,.0f} s",
+            f"{row['behind']:,}",
+            f"{row['rebased']:,}",
+        )
+        for name, row in found
+    ]
+    return ("replica", "upstream", "link", "behind", "rebased"), rows
 
 
 def _workers(seen: dict[str, Any]) -> _Table:

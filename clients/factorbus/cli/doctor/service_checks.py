@@ -48,6 +48,9 @@ def _troubles(stats: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     for row in stats["maps"]:
         if why := row.get("journal", {}).get("problem"):
             yield "fail", why, "make room or make it writable: the map goes on by itself"
+    for row in stats["maps"]:
+        if follows := row.get("upstream"):
+            yield from _following(row["name"], follows)
     if not stats["ready"]:
         yield "warn", "alive, but not ready", "it is starting or stopping: look again"
     if (version := stats["version"]) != __version__:
@@ -57,3 +60,20 @@ def _troubles(stats: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
         if inserts["busy"] > 0.1 * max(inserts["accepted"], 10):
             mend = "clients send faster than it solves: insert less often, or spread maps over more services"
             yield "warn", f"map {row['name']} answered {inserts['busy']} of its inserts with busy", mend
+
+
+def _following(name: str, row: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """What is wrong between a replica's map and its upstream."""
+    behind = f"upstream {row['endpoint']} lacks {counted(row['behind'], 'insert')} of map {name}"
+    if row["code"]:
+        yield (
+            "fail",
+            f"{behind}: {row['problem']}",
+            f"`factorbus explain {row['code']}` says more; the map here goes on",
+        )
+    elif not row["connected"]:
+        seen = f"{behind}, out of reach for {row['since_s']:.0f} s"
+        yield "warn", seen, "the map here goes on and sends them when the link is back; is the service there running?"
+    elif not row["same_bits"]:
+        mend = "run the same version of factorbus, on the same kind of processor, at both ends"
+        yield "warn", f"map {name} has other bits than upstream {row['endpoint']}", mend

@@ -65,6 +65,7 @@ class Indicators:
                 "gave_up": stats["gave_up"],
                 "refused": stats["inserts"]["refused"],
                 "busy": stats["inserts"]["busy"],
+                **({"upstream": stats["upstream"]} if "upstream" in stats else {}),  # of a replica
             }
         )
         carried = {row["channel"]: row["bytes"] for row in before.get("interests", ())}

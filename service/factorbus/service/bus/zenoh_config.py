@@ -51,3 +51,16 @@ def zenoh_settings(config: Config) -> dict[str, Any]:
         # Without something to connect to there is nobody to wait for; with it, start-up does not hang on it.
         settings |= {"scouting/delay": 0, "connect/timeout_ms": -1, "connect/exit_on_failure": False}
     return settings
+
+
+def upstream_settings(endpoint: str) -> dict[str, Any]:
+    """What a replica sets in the configuration of its session with its upstream."""
+    return {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": 3000,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+    }

@@ -20,7 +20,7 @@ from factorbus.proto.ports import check_endpoints
 from factorbus.proto.problems import Problem, Unavailable
 from factorbus.service.bus.bind_address_check import refuse_exposed
 from factorbus.service.bus.key_files import refuse_unsafe_keys
-from factorbus.service.bus.zenoh_config import RUNTIME, RUNTIME_VARIABLE, zenoh_settings
+from factorbus.service.bus.zenoh_config import RUNTIME, RUNTIME_VARIABLE, upstream_settings, zenoh_settings
 from factorbus.service.config import BadConfig, Config
 from factorbus.service.core.events import Asker
 from factorbus.service.jobs.job_check import WrongAnswer
@@ -144,6 +144,64 @@ class ServiceBus:
         self._session.close()
 
 
+class UpstreamBus:
+    """A replica's session with its upstream: a client of it, as any other."""
+
+    def __init__(self, session: zenoh.Session, see: Callable[[bool], None]) -> None:
+        """see: called with whether somebody is there to ask."""
+        self._session, self._keys = session, dict[str, zenoh.KeyExpr]()
+        there: set[str] = set()
+
+        def on_change(sample: zenoh.Sample) -> None:
+            (there.add if sample.kind == zenoh.SampleKind.PUT else there.discard)(str(sample.key_expr))
+            see(bool(there))
+
+        self._watching = session.liveliness().declare_subscriber(
+            keys.any_features_token(), Callback(on_change, indirect=False), history=True
+        )
+
+    def ask(self, key: str, payload: bytes, timeout_s: float, done: Callable[[Any], None]) -> None:
+        """`done` gets the bytes of the first answer, or a Problem; None: nobody answered, False: not in time."""
+        answered = False
+
+        def finish(result: Any) -> None:
+            nonlocal answered
+            if not answered:
+                answered = True
+                done(result)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            finish(_answer_in(reply))
+
+        callback = Callback(on_reply, drop=lambda: finish(None), indirect=False)
+        if key not in self._keys:  # on the wire it is a number from then on
+            self._keys[key] = self._session.declare_keyexpr(key)
+        try:
+            self._session.get(self._keys[key], callback, payload=payload, timeout=timeout_s)
+        except zenoh.ZError as error:
+            log.debug("not asked on %s: %s", key, error)
+            finish(None)
+
+    def close(self) -> None:
+        """End the session."""
+        self._watching.undeclare()
+        self._session.close()
+
+
+def open_upstream_bus(endpoint: str, zenoh_file: str, see: Callable[[bool], None]) -> UpstreamBus:
+    """A session with the service or router at `endpoint`.  Raises Unavailable, BadConfig."""
+    try:
+        settings = zenoh.Config.from_file(zenoh_file) if zenoh_file else zenoh.Config()
+        for path, value in upstream_settings(endpoint).items():
+            settings.insert_json5(path, json.dumps(value))
+    except zenoh.ZError as error:
+        raise BadConfig(f"Zenoh does not take {zenoh_file or 'this configuration'}: {redact.reason(error)}") from None
+    try:
+        return UpstreamBus(zenoh.open(settings), see)
+    except zenoh.ZError as error:
+        raise Unavailable(f"the upstream at {redact.endpoint(endpoint)}", 0.0, redact.reason(error)) from None
+
+
 class MapPlace:
     """One map's publications, and its token."""
 
@@ -239,6 +297,16 @@ def refuse(query: zenoh.Query, problem: Any, following: int | None = None) -> No
 def ignore(query: zenoh.Query) -> None:
     """End the query without an answer: somebody else may have one."""
     query.drop()
+
+
+def _answer_in(reply: zenoh.Reply) -> Any:
+    if reply.ok is not None:
+        return reply.ok.payload.to_bytes()
+    payload = reply.err.payload.to_bytes() if reply.err is not None else b""
+    try:
+        return False if payload == _TIMED_OUT else codec.decode_problem(payload)
+    except Problem as unreadable:
+        return unreadable
 
 
 def _job_result(reply: zenoh.Reply, silence: Problem) -> Any:

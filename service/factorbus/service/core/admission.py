@@ -30,7 +30,7 @@ only a number of them may be without an answer: more are refused as busy, not us
 from collections import OrderedDict, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from itertools import count
 
 from factorbus.proto.problems import BadSequence, Busy, Problem, ShuttingDown, TooLarge, WrongEpoch
@@ -103,6 +103,12 @@ class Admission:
         """The number that client `name` has to send next; 1 of one that is not known."""
         client = self._clients.get(name)
         return client.next if client is not None else 1
+
+    def check_numbers(self, inserts: Iterable[tuple[str, int]]) -> None:
+        """Raises BadSequence where one of (client, number) is used up."""
+        for client, sequence in inserts:
+            if sequence < (wanted := self.wanted(client)):
+                raise BadSequence(client, sequence, f"{wanted} or more of that client", wanted)
 
     def take_alone(self, arrived: Arrived) -> bool:
         """Take the insert, if it is next, and nothing else waits here or is parked; if not, `admit` it."""
@@ -212,6 +218,25 @@ class Admission:
         client.answered.update((sequence, (digest, answer)) for sequence, digest, answer in answered)
         self._clients[name] = client
 
+    def note(self, name: str, sequence: int, digest: int, answer: object, now: float) -> list[Effect]:
+        """Insert `sequence` of client `name` came to the map by way of another journal, and has this answer."""
+        client = self._clients.setdefault(name, _Client(heard=now, seen=now))
+        waiting = client.open.pop(sequence, None)
+        effects: list[Effect] = []
+        if waiting is not None:
+            self._no_longer_waits(client, waiting)
+            same = waiting.digest == digest
+            said = answer if same else BadSequence(name, sequence, "a number not used for another insert", sequence + 1)
+            effects = [_reply(asker, said, sequence) for asker in waiting.askers]
+        client.answered[sequence] = (digest, answer)
+        if len(client.answered) > self._limits.remembered:
+            client.answered.popitem(last=False)
+        client.next = max(client.next, sequence + 1)
+        while client.next in client.parked:
+            self._parked -= 1
+            self._make_ready(client, client.parked.pop(client.next))
+        return effects
+
     def took(self, inserts: int, seconds: float) -> None:
         """Learn the pace: `inserts` were applied `seconds`."""
         if inserts:
@@ -306,6 +331,17 @@ class Admission:
         client.open[insert.sequence] = insert
         client.next += 1
         self._ready += 1
+
+    def _no_longer_waits(self, client: _Client, insert: Arrived) -> None:
+        self._bytes -= insert.size
+        if client.parked.pop(insert.sequence, None) is not None:
+            self._parked -= 1
+            return
+        client.ready.remove(insert)
+        self._ready -= 1
+        if not client.ready:
+            self._turns = [turn for turn in self._turns if turn[2] != insert.client]
+            heapify(self._turns)
 
     def _park(self, client: _Client, arrived: Arrived) -> None:
         window = self._limits.waiting

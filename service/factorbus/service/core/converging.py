@@ -17,6 +17,7 @@ from factorbus.wording import counted
 # Idle is a map whose last step of another sort ended so long ago: one that has not converged goes on, and one that has
 # is polished, that is, goes on to its optimum.
 CONVERGE_IDLE_S, POLISH_IDLE_S = 0.1, 1.0
+GRAFT_IDLE_S = 3.0  # longer by so much where the last steps were those of another journal
 FULL_SPEED_S = 2.0  # of a core, for further steps in a row; then the solver rests after each for as long as it worked
 MOST, MOST_S = 10_000, 300.0  # further steps in a row, and the seconds of a core for them
 # Without use is a step that does not lower χ² by this share, below the least so far; and one that changes nothing.
@@ -67,6 +68,11 @@ class Converging:
         elif self._under_way:
             self._busy_at = now
         self._under_way = ""
+
+    def hold(self, now: float) -> None:
+        """What came last was made elsewhere, where further steps are taken, too."""
+        self._busy_at = now + GRAFT_IDLE_S
+        self._goes_on = False
 
     def refused(self) -> None:
         """The further step was refused: the map is where it was, so the next one would be, too."""

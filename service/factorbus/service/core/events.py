@@ -139,6 +139,22 @@ class SingleInsertResult(NamedTuple):
     applied: Applied
 
 
+class Restored(NamedTuple):
+    """How a map is that was here before.
+
+    differs: why its journal, run again, may give other bits; empty: as far as is known it gives the same; None: it has
+    none.
+    """
+
+    revision: int
+    variables: int
+    factors: int
+    chi2: float
+    converged: bool = True
+    unfinished: bool = False
+    differs: str | None = None
+
+
 # ---- what waits -------------------------------------------------------------------------------------------------
 
 

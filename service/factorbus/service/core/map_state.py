@@ -12,7 +12,7 @@ then.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from factorbus.proto import codec
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
@@ -32,12 +32,13 @@ from factorbus.service.core.events import (
     Publish,
     Read,
     Refuse,
+    Restored,
     SingleInsertResult,
     Stepped,
     Tell,
     Verdict,
-)
-from factorbus.service.core.pending_questions import Reads
+)  # fmt: skip
+from factorbus.service.core.pending_questions import Reads, is_graft
 from factorbus.service.core.statistics import InsertDone, MapStatistics
 from factorbus.service.questions.admin import MovedOn
 from factorbus.service.questions.answers import Question, parse
@@ -50,22 +51,6 @@ SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
 
 
-class Restored(NamedTuple):
-    """How a map is that was here before.
-
-    differs: why its journal, run again, may give other bits; empty: as far as is known it gives the same; None: it has
-    none.
-    """
-
-    revision: int
-    variables: int
-    factors: int
-    chi2: float
-    converged: bool = True
-    unfinished: bool = False
-    differs: str | None = None
-
-
 class MapCore:
     """The state of one map, short of its estimate.  Every method takes an event and returns effects, in order."""
 
@@ -75,6 +60,7 @@ class MapCore:
         self.differs: str | None = None  # as `Restored` has it
         self._limits, self._created = limits, now
         self._admission = Admission(epoch, limits)
+        self.check_numbers = self._admission.check_numbers
         self._reads = Reads()
         self._running: InsertBatch | None = None
         self._unanswered = self._unanswered_bytes = 0  # given to the solver, and not answered
@@ -232,6 +218,16 @@ class MapCore:
             self._moved_at = stepped.revision
         return [Publish("delta", stepped.delta)]
 
+    def grafted(
+        self, inserts: Iterable[tuple[str, int, int, object]], steps: Iterable[Stepped], now: float
+    ) -> list[Effect]:
+        """Records of another journal were applied: (client, number, digest, answer) of each insert; the steps made."""
+        effects = [effect for insert in inserts for effect in self._admission.note(*insert, now)]
+        for stepped in steps:
+            effects += self.stepped(stepped)
+        self._converging.hold(now)  # who sent them takes further steps, too, and sends those
+        return effects
+
     def _moved_on(self, revision: int, delta_bytes: int) -> None:
         self.revision = revision
         self._since_snapshot[0] += 1
@@ -333,7 +329,10 @@ class MapCore:
         room = self._has_room()
         further = self._may_go_on(now)
         if self._reads or self._must_reload or (self._admission.ready and room) or further:
-            reads, inserts = self._reads.take(), self._admission.take(limits.step_inserts) if room else ()
+            reads = self._reads.take()
+            if is_graft(reads):  # nothing goes with it
+                room = further = False
+            inserts = self._admission.take(limits.step_inserts) if room else ()
             short = self._is_short(reads, inserts, now)
             self._running = InsertBatch(reads, inserts, short, self._must_reload, further)
             if inserts or further:

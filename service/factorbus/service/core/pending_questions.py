@@ -7,7 +7,7 @@ number of variables together, and the others stay for the next one, which takes 
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from factorbus.service.core.events import Read
 from factorbus.service.questions.uncertainty import NEAR, near_variables
@@ -34,7 +34,13 @@ class Reads:
         self._waiting.clear()
 
     def take(self) -> tuple[Read, ...]:
-        """What the next InsertBatch answers: all that take copies, of the others the oldest, up to `NEAR` variables."""
+        """What the next InsertBatch answers: all that take copies, of the others the oldest, up to `NEAR` variables.
+
+        What puts records of another journal into this one comes first, and alone.
+        """
+        if (graft := next((read for read in self._waiting if is_graft((read,))), None)) is not None:
+            self._waiting.remove(graft)
+            return (graft,)
         taken: list[Read] = []
         stay: deque[Read] = deque()
         variables, is_full = 0, False
@@ -48,3 +54,8 @@ class Reads:
                 taken.append(read)
         self._waiting = stay
         return tuple(taken)
+
+
+def is_graft(reads: Sequence[Read]) -> bool:
+    """Is it one that puts records of another journal into the map's own?"""
+    return len(reads) == 1 and reads[0].question.name == "graft"

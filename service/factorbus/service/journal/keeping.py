@@ -16,15 +16,17 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 from factorbus.journal.checkpoints import file_of, write_checkpoint
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
-from factorbus.journal.records import JournalRecord
-from factorbus.journal.store import Checkpoint, Last, Store, open_store
-from factorbus.service.core.events import Arrived, Stepped, Verdict
+from factorbus.journal.records import Checkpoint, JournalRecord, Last
+from factorbus.journal.rewriting import UpstreamPlace, note_upstream, rewrite
+from factorbus.journal.store import Store, open_store
+from factorbus.service.core.events import Arrived, Stepped
 from factorbus.service.journal.checkpoint_plan import CheckpointPlan
+from factorbus.service.journal.items import AfterWriting, HandedBatch, NotedCheckpoint, SolverReloaded
+from factorbus.service.journal.listener import Events, Listener
 from factorbus.service.journal.writing import written
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.build import present_build
@@ -35,52 +37,6 @@ log = logging.getLogger(__name__)
 _NONE_S = 1.0  # durability none: how often what there is gets written
 _PAUSES_S = (0.2, 5.0)  # between tries to write again
 _KEPT_CHECKPOINTS = 2
-
-Events: TypeAlias = Sequence[Verdict | Stepped]
-
-
-class Listener(Protocol):
-    """What is called with what becomes of the writing, on the journal's thread."""
-
-    def kept(self, events: Events) -> None:
-        """What came of an InsertBatch is safe."""
-        ...
-
-    def unkept(self, problem: JournalFailed) -> None:
-        """What `kept` has not been called for did not happen; the solver goes back, and `reloaded` is to be called."""
-        ...
-
-    def blocked(self, problem: JournalFailed) -> None:
-        """The disk takes nothing at the moment."""
-        ...
-
-    def unblocked(self) -> None:
-        """It takes something again."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class _Applied:
-    number: int
-    inserts: Sequence[Arrived]
-    events: Events
-    further: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _After:
-    call: Callable[[], None]
-    dropped: Callable[[JournalFailed], None]
-
-
-@dataclass(frozen=True, slots=True)
-class _Noted:
-    saved: Checkpoint
-    life: int
-
-
-class _Reloaded:
-    """The solver is where the journal is."""
 
 
 class Keeping(Protocol):
@@ -103,17 +59,20 @@ class Keeper:
         begin: Callable[[Store], None] = lambda _: None,
     ) -> None:  # fmt: skip
         self._store, self._listener = store, listener
-        self._folder, self._durability = store.path.parent, durability
+        self.folder, self._durability = store.path.parent, durability
         self._pause_s = {"commit": 0.0, "group": group_s, "none": _NONE_S}[durability]
         self._begin, self._begun = begin, False
-        self._last, self._number = last, last.record
+        self.last, self._number = last, last.record  # `last`: as it is on the disk
         self._items: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._problem: JournalFailed | None = None
         self._checkpoint = checkpoint
         self._life = 0  # counts how often the solver went back to where the journal ends
+        # Called with records that are in the journal now; with None where it was rewritten.
+        self.written: Callable[[Sequence[JournalRecord] | None], None] = lambda _: None
+        self.upstream: UpstreamPlace | None = None  # of a replica: up to where its upstream has the same
         self._commits, self._commit_s, self._longest_s, self._inserts = 0, 0.0, 0.0, 0
-        self._thread = threading.Thread(target=self._run, name=f"journal {self._folder.name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"journal {self.folder.name}", daemon=True)
 
     @property
     def waits(self) -> bool:
@@ -134,18 +93,30 @@ class Keeper:
         if inserts or events or further:
             self._number += 1
             self._checkpoint.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
-            self._items.put(_Applied(self._number, inserts, events, further))
+            self._items.put(HandedBatch(self._number, inserts, events, further))
 
     def after(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
         """Do `call` when all that was handed in so far is published; `dropped` if it never will be."""
         if self.waits:
-            self._items.put(_After(call, dropped))
+            self._items.put(AfterWriting(call, dropped))
         else:
             call()
 
     def when_written(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
         """Do `call` when all that was handed in so far is in the journal; `dropped` if it never will be."""
-        self._items.put(_After(call, dropped))
+        self._items.put(AfterWriting(call, dropped))
+
+    def settle(self) -> None:
+        """Return when all that was handed in so far is in the journal.  Raises JournalFailed if it never will be."""
+        self._on_journal(lambda: None)
+
+    def rewrite(self, last: Last, records: Sequence[JournalRecord], place: UpstreamPlace | None) -> None:
+        """After `last` the journal has `records` and nothing else, when this returns; all was settled before.
+
+        place: see `rewriting.rewrite`.  Raises JournalFailed: then nothing has changed.
+        """
+        self._on_journal(lambda: self._rewrite(last, records, place))
+        self._number = last.record + len(records)
 
     @property
     def records(self) -> int:
@@ -156,7 +127,7 @@ class Keeper:
         """The solver is where the journal ends."""
         self._number = last.record
         self._life += 1
-        self._items.put(_Reloaded())
+        self._items.put(SolverReloaded())
 
     def wants_checkpoint(self) -> bool:
         """Whether a copy of the solver's state is to be handed in now."""
@@ -180,8 +151,8 @@ class Keeper:
         """What ask/stats says of the journal."""
         return {
             "durability": self._durability,
-            "records": self._last.record,
-            "revision": self._last.revision,
+            "records": self.last.record,
+            "revision": self.last.revision,
             "commits": self._commits,
             "inserts": self._inserts,
             "commit_ms": 1e3 * self._commit_s,
@@ -203,6 +174,7 @@ class Keeper:
                 if dump is not None and self._checkpoint.steps_s > 0.1 * self._checkpoint.every_s:
                     self._write_checkpoint(dump(), self._number, self._life)
                 self._note_checkpoints()
+                note_upstream(self._store, self.upstream)
                 self._store.end()
             except JournalFailed as problem:
                 log.error("%s", problem)
@@ -245,9 +217,9 @@ class Keeper:
 
     def _write(self, batch: list[Any]) -> JournalFailed | None:
         """Write `batch` in one transaction and tell; with a problem nothing of it is written or told."""
-        records, last = [], self._last
+        records, last = [], self.last
         for item in batch:
-            if isinstance(item, _Applied):
+            if isinstance(item, HandedBatch):
                 record = written(item.number, item.inserts, item.events, last, item.further)
                 records.append(record)
                 last = Last(record.number, record.revision, record.chain)
@@ -258,15 +230,45 @@ class Keeper:
             self._problem = problem
             log.error("%s", problem)
             return problem
-        self._last = last
+        self.last = last
+        if records:
+            self.written(records)
         for item in batch:
-            if isinstance(item, _After):
+            if isinstance(item, AfterWriting):
                 item.call()
-            elif isinstance(item, _Applied) and self.waits:
+            elif isinstance(item, HandedBatch) and self.waits:
                 self._listener.kept(item.events)
-            elif isinstance(item, _Noted):
+            elif isinstance(item, NotedCheckpoint):
                 self._note(item)
         return None
+
+    def _on_journal(self, call: Callable[[], None]) -> None:
+        """Do `call` on the journal's thread, behind all that was handed in.  Raises JournalFailed."""
+        done: queue.SimpleQueue[JournalFailed | None] = queue.SimpleQueue()
+
+        def do() -> None:
+            try:
+                call()
+            except JournalFailed as problem:
+                done.put(problem)
+            else:
+                done.put(None)
+
+        self.when_written(do, done.put)
+        if (problem := done.get()) is not None:
+            raise problem
+
+    def _rewrite(self, last: Last, records: Sequence[JournalRecord], place: UpstreamPlace | None) -> None:
+        gone = rewrite(self._store, last, records, place, present_build())
+        for record in gone:
+            file_of(self.folder, record).unlink(missing_ok=True)
+        if last.record < self.last.record:
+            self._life += 1
+            self._checkpoint.record = min(self._checkpoint.record, last.record)
+        if records:
+            last = Last(records[-1].number, records[-1].revision, records[-1].chain)
+        self.last, self.upstream = last, place or self.upstream
+        self.written(None)
 
     def _append(self, records: list[JournalRecord]) -> None:
         started = time.perf_counter()
@@ -280,13 +282,13 @@ class Keeper:
     def _drop_until_reloaded(self, batch: list[Any], problem: JournalFailed) -> None:
         """Nothing of what comes before the solver is back where the journal is counts any more."""
         for item in batch:
-            if isinstance(item, _After):
+            if isinstance(item, AfterWriting):
                 item.dropped(problem)
-        while not isinstance(item := self._items.get(), _Reloaded):
+        while not isinstance(item := self._items.get(), SolverReloaded):
             if item is None:
                 self._items.put(None)
                 return
-            if isinstance(item, _After):
+            if isinstance(item, AfterWriting):
                 item.dropped(problem)
 
     def _wait_until_writable(self) -> None:
@@ -303,7 +305,7 @@ class Keeper:
             if item is None:
                 self._items.put(None)
                 return
-            if isinstance(item, _After):
+            if isinstance(item, AfterWriting):
                 item.call()
         self._recovered()
 
@@ -312,7 +314,7 @@ class Keeper:
         pause_s, longest_s = _PAUSES_S
         while self._write(batch) is not None:
             if self._ending.wait(pause_s):
-                lost = sum(len(item.inserts) for item in batch if isinstance(item, _Applied))
+                lost = sum(len(item.inserts) for item in batch if isinstance(item, HandedBatch))
                 log.error("%s: %d inserts and more that were answered are not written", self._store.path, lost)
                 return False
             pause_s = min(2 * pause_s, longest_s)
@@ -349,7 +351,7 @@ class Keeper:
     def _reopen(self) -> None:
         # The old one is closed first: in one process, what is open for reading keeps all others from writing.
         self._store.close()
-        self._store = open_store(self._folder, self._durability)
+        self._store = open_store(self.folder, self._durability)
         if not self._store.writable:
             raise JournalFailed(self._store.path, "it is read-only")
 
@@ -358,33 +360,36 @@ class Keeper:
     def _write_checkpoint(self, state: dict[str, Any], record: int, life: int) -> None:
         """On a thread of its own; the journal's thread notes it behind the record that it was made after."""
         started = time.perf_counter()
-        path = file_of(self._folder, record)
+        path = file_of(self.folder, record)
         try:
             size = write_checkpoint(path, state)
         except OSError as error:
             log.warning("no checkpoint in %s: %s; a restart takes longer without it", path, error)
             return
         log.info("%s: %.1f MB in %.2f s", path, size / 1e6, time.perf_counter() - started)
-        self._items.put(_Noted(Checkpoint(record, FORMAT, present_build(), self._checkpoint.differs, size), life))
+        self._items.put(
+            NotedCheckpoint(Checkpoint(record, FORMAT, present_build(), self._checkpoint.differs, size), life)
+        )
 
-    def _note(self, noted: _Noted) -> None:
+    def _note(self, noted: NotedCheckpoint) -> None:
         """A checkpoint counts once it is noted; one of records that did not happen must not."""
         saved = noted.saved
         if noted.life != self._life:
-            file_of(self._folder, saved.record).unlink(missing_ok=True)
+            file_of(self.folder, saved.record).unlink(missing_ok=True)
             return
         try:
-            old = self._store.add_checkpoint(saved, _KEPT_CHECKPOINTS)
+            old = self._store.add_checkpoint(saved, _KEPT_CHECKPOINTS, self.upstream.record if self.upstream else 0)
+            note_upstream(self._store, self.upstream)
         except JournalFailed as problem:
             log.warning("checkpoint %d is not noted: %s", saved.record, problem)
-            file_of(self._folder, saved.record).unlink(missing_ok=True)
+            file_of(self.folder, saved.record).unlink(missing_ok=True)
             return
         self._checkpoint.record = saved.record
         for record in old:
-            file_of(self._folder, record).unlink(missing_ok=True)
+            file_of(self.folder, record).unlink(missing_ok=True)
 
     def _note_checkpoints(self) -> None:
         """Those that were written while the journal's thread ended."""
         while not self._items.empty():
-            if isinstance(item := self._items.get(), _Noted):
+            if isinstance(item := self._items.get(), NotedCheckpoint):
                 self._note(item)

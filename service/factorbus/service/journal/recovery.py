@@ -11,6 +11,7 @@ That is said, and is no reason to begin at the beginning.  See docs/decisions/st
 
 import logging
 from collections.abc import Iterator
+from itertools import takewhile
 from typing import NamedTuple
 
 from factorbus.journal import chain
@@ -47,13 +48,13 @@ class Recovered(NamedTuple):
     differs: str = ""
 
 
-def recover(store: Store, map_solver: MapSolver) -> Recovered:
-    """Bring `map_solver` to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
-    saved, whole = _from_checkpoint(store, map_solver)
+def recover(store: Store, map_solver: MapSolver, until: int = 1 << 62) -> Recovered:
+    """Bring `map_solver` to where the journal ends, or to record `until`.  Raises JournalDamaged, JournalDiffers."""
+    saved, whole = _from_checkpoint(store, map_solver, until)
     begin = store.last_at(saved.record) if saved else Last(0, 0, chain.START)
     history, (other, compared) = _History(store, map_solver), _other_builds(store, saved)
     last, records, differs_from = begin, 0, 0
-    for record in store.records(begin.record):
+    for record in takewhile(lambda record: record.number <= until, store.records(begin.record)):
         if history.again(record, last.chain, bool(other)) != record.chain and not differs_from:
             log.warning("%s: from revision %d on, values have other bits than they had", store.path, record.revision)
             differs_from = record.revision
@@ -103,7 +104,7 @@ class _History:
         return present
 
     def _apply(self, record: JournalRecord, present: bytes) -> bytes:
-        inserts = [_arrived(entry) for entry in record.entries if entry.outcome != UNTRIED]
+        inserts = [arrived_again(entry) for entry in record.entries if entry.outcome != UNTRIED]
         outcomes: dict[tuple[str, int], int] = {}
         for event in self._map_solver.apply_again(inserts, record.rebuilt, record.further):
             if isinstance(event, Verdict):
@@ -132,9 +133,11 @@ def answers(sender: Sender) -> Iterator[tuple[int, int, object]]:
         yield entry.sequence, message_digest(entry.message), answer
 
 
-def _from_checkpoint(store: Store, map_solver: MapSolver) -> tuple[Checkpoint | None, bool]:
+def _from_checkpoint(store: Store, map_solver: MapSolver, until: int) -> tuple[Checkpoint | None, bool]:
     """Begin with the newest checkpoint that can be used, or nothing; and whether `map_solver` has it to the bit."""
     for saved in store.checkpoints():
+        if saved.record > until:
+            continue
         path = file_of(store.path.parent, saved.record)
         if saved.format != FORMAT:
             log.warning("%s has a state of format %d, this version reads %d: not used", path, saved.format, FORMAT)
@@ -172,6 +175,7 @@ def _why_it_differs(saved: Checkpoint | None, other: str, compared: int, differs
     return saved.differs
 
 
-def _arrived(entry: Entry) -> Arrived:
+def arrived_again(entry: Entry) -> Arrived:
+    """An insert as it came, without anybody who waits for its answer."""
     digest, content = read_again(entry.message)
     return Arrived([], entry.client, entry.sequence, 0, len(entry.message), digest, content, 0.0, entry.message)

@@ -21,6 +21,7 @@ from typing import Any, TypeAlias
 
 from factorbus.journal.problems import JournalFailed
 from factorbus.proto.problems import Internal, Problem
+from factorbus.proto.records import JournalPlace, RecordsAnswer, encode_records_answer
 from factorbus.service.core.events import (
     Answer,
     Applied,
@@ -37,9 +38,12 @@ from factorbus.service.core.events import (
     Verdict,
 )
 from factorbus.service.core.map_state import MapCore
+from factorbus.service.core.pending_questions import is_graft
 from factorbus.service.journal.keeping import Events, Keeper, Keeping
 from factorbus.service.process.health import Pulse
-from factorbus.service.questions.answers import QuestionCopies
+from factorbus.service.questions.answers import Question, QuestionCopies
+from factorbus.service.replica.grafting import Graft, graft_records
+from factorbus.service.replica.problems import NotRecorded
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.errors import SolverError
 
@@ -81,6 +85,7 @@ class Host:
             inline_run,
         )
         self._send_both = send_both
+        self.upstream_stats: Callable[[], dict[str, Any]] = dict  # of a replica
         self._lock = threading.Lock()
         self._runs: queue.SimpleQueue[InsertBatch | Callable[[], None] | None] = queue.SimpleQueue()
         self._pulse = Pulse(self._runs.put)
@@ -134,6 +139,15 @@ class Host:
             effects = self.core.read(read, time.monotonic())
         self._perform(effects)
 
+    def graft(self, asker: Asker, graft: Graft) -> None:
+        """Put records of another journal into this one; `asker` gets a RecordsAnswer."""
+        self.read(Read(Question("graft", ask=graft), asker))
+
+    @property
+    def keeper(self) -> Keeper | None:
+        """What writes the journal, if there is one."""
+        return self._keeper
+
     def tick(self) -> None:
         """Time went by."""
         with self._lock:
@@ -186,7 +200,7 @@ class Host:
 
     def journal(self) -> dict[str, Any]:
         """What ask/stats says of the journal, if there is one."""
-        return {} if self._keeper is None else {"journal": self._keeper.stats()}
+        return {} if self._keeper is None else {"journal": self._keeper.stats(), **self.upstream_stats()}
 
     # ---- what becomes of the writing: on the journal's thread -------------------------------------------------------
 
@@ -279,7 +293,9 @@ class Host:
         """The same with a journal: what comes of it is told when that is safe, or at once if it need not be."""
         if run.reload and self._keeping is not None:
             keeper.reloaded(self._keeping.reload(self._map_solver))
-        if run.reads:
+        if is_graft(run.reads):
+            self._graft(run.reads[0], keeper)
+        elif run.reads:
             self._read(run.reads)
         events, applied = self._map_solver.apply_whole(run.inserts, run.further)
         keeper.hand(run.inserts, events, run.further)
@@ -294,6 +310,38 @@ class Host:
         with self._lock:
             effects = self.core.applied(applied)
         self._perform(effects)
+
+    def _graft(self, read: Read, keeper: Keeper) -> None:
+        graft: Graft = read.question.ask
+        try:
+            if self._keeping is None:
+                raise NotRecorded(self.core.name)
+            reload, check = self._keeping.reload, self._check_numbers
+            done = graft_records(self.core.name, graft, self._map_solver, keeper, reload, check)
+        except (Problem, SolverError) as problem:
+            self._refuse([read], problem)
+            return
+        except Exception:
+            reference = secrets.token_hex(4)
+            log.exception("fault %s: records of another journal are not taken into map %s", reference, self.core.name)
+            self._refuse([read], Internal(reference))
+            return
+        for refused in done.refused:
+            log.warning(
+                "map %s: insert %d of client %s, accepted here before, is refused upstream: %s", self.core.name,
+                refused.sequence, refused.client, refused.answer, extra={"map": self.core.name},
+            )  # fmt: skip
+        with self._lock:
+            effects = self.core.grafted(done.inserts, done.steps, time.monotonic())
+        self._do(effects)
+        graft.heard(done)
+        place = JournalPlace(done.last.record, done.last.chain)
+        answer = RecordsAnswer(self.core.epoch, place, same=done.same_outcomes)
+        self._do([Answer(read.asker, encode_records_answer(answer))])
+
+    def _check_numbers(self, inserts: Iterable[tuple[str, int]]) -> None:
+        with self._lock:
+            self.core.check_numbers(inserts)
 
     def _read(self, reads: Sequence[Read]) -> None:
         try:

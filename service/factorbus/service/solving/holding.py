@@ -148,6 +148,16 @@ class Holding:
         """To see whether it was replaced."""
         return self._solver
 
+    def whole_estimate(self, told: Mapping[str, Any]) -> Stepped:
+        """The whole estimate as the delta of the last step, whose report says what is `told`, too."""
+        reported = {**self._last_report, **told}
+        _, graph = self._solver.pick_changed()
+        everything = np.arange(self._solver.variable_count)
+        delta = self._messages.write_delta(self._step(0), reported, everything, graph)
+        strategy, solver_ms = str(reported.get("strategy", "")), float(reported.get("solver_ms", 0.0))
+        state = {"converged": self._converged, "unfinished": self._unfinished}
+        return Stepped(self._revision, delta, strategy, self.chi2(), solver_ms, **state)
+
     def memory_bytes(self) -> int:
         """What its solver has in use."""
         return int(self._solver.memory_bytes())

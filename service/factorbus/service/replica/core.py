@@ -1,0 +1,216 @@
+"""How a map follows its upstream: what is asked, sent and put in next.  Pure: events in, effects out; one at a time.
+
+    joins ──▶ asks what came after the last place known to be the same ──▶ puts it in ──▶ ...
+                 ▲                                                            │ nothing came
+                 │ upstream moved on, or nobody knows whether it was taken    ▼
+                 └───────────────────────────────────────── sends what is here alone ──▶ ...
+
+A place is known to be the same only when upstream has said so.  After silence it is asked for, so what was sent and not
+answered is neither lost nor there twice.  Events carry the number of what they answer; that of an earlier one is
+dropped.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from factorbus.proto.records import MOST_BYTES, JournalPlace, RecordsAnswer, SentRecord
+
+SEND_S = 0.1  # between what is sent: inserts of that time go together, in fewer bytes
+POLL_S = 1.0  # with nothing to send, upstream is asked so often
+PAUSES_S = (0.1, 1.0)  # after silence, doubling
+REFUSED_S = 5.0  # after a refusal that time alone will not mend
+LEAST_BYTES = 4 << 10
+_RETRIED = ("busy", "shutting_down", "journal_failed", "out_of_memory", "unavailable")
+
+
+@dataclass(frozen=True, slots=True)
+class JoinUpstream:
+    """Ask for the map upstream; it is made there if it is not."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class AskUpstream:
+    """Ask what came after `after`.  unsure: up to this record upstream may have what is here."""
+
+    number: int
+    after: JournalPlace
+    unsure: int
+    most_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class SendUpstream:
+    """Send what is here after `after`."""
+
+    number: int
+    after: JournalPlace
+    most_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class PutIn:
+    """Put `records` behind `after`; `place` is where upstream is with them."""
+
+    number: int
+    after: JournalPlace
+    records: tuple[SentRecord, ...]
+    place: JournalPlace
+
+
+UpstreamEffect: TypeAlias = JoinUpstream | AskUpstream | SendUpstream | PutIn
+
+
+class UpstreamCore:
+    """One map's replica.  place: the last that is known to be the same at both ends; head: the last record here."""
+
+    def __init__(self, place: JournalPlace, head: int, now: float) -> None:
+        self.place, self.head = place, head
+        self.connected, self.since = False, now
+        self.problem: Any = None  # why upstream takes nothing though it is there
+        self._alive = False
+        self._joined, self._must_ask = False, True
+        self._unsure = head  # records up to here may be upstream, though it has not said so
+        self._number, self._doing = 0, ""
+        self._more = False
+        self._not_before, self._pause_s, self._heard = -math.inf, PAUSES_S[0], -math.inf
+        self._most_bytes = MOST_BYTES
+
+    def link(self, alive: bool, now: float) -> list[UpstreamEffect]:
+        """Upstream is seen, or not any more."""
+        self._alive = alive
+        if not alive:
+            self._lost(now)
+            return []
+        self._not_before, self._pause_s = now, PAUSES_S[0]
+        return self._go_on(now)
+
+    def grew(self, head: int, now: float) -> list[UpstreamEffect]:
+        """The journal here ends at `head`."""
+        self.head = head
+        return self._go_on(now)
+
+    def tick(self, now: float) -> list[UpstreamEffect]:
+        """Time went by."""
+        return self._go_on(now)
+
+    def due_s(self, now: float) -> float | None:
+        """In how many seconds `tick` is to be called; None: only something that happens will change anything."""
+        if not self._alive or self._doing:
+            return None
+        wait_s = SEND_S if self.head > self.place.record and not self._must_ask else POLL_S
+        at = self._heard + wait_s if self._joined and not self._must_ask else now
+        return max(at, self._not_before, now) - now
+
+    def joined(self, number: int, now: float) -> list[UpstreamEffect]:
+        """The map is there."""
+        if not self.joining(number):
+            return []
+        self._heard_from(now)
+        self._joined = True
+        return self._go_on(now)
+
+    def joining(self, number: int) -> bool:
+        """Is it the map's row that this answers with?"""
+        return number == self._number and self._doing == "join"
+
+    def sent(self, number: int, until: int) -> None:
+        """What was to be sent is on its way, up to record `until`."""
+        if number == self._number:
+            self._unsure = max(self._unsure, until)
+
+    def answered(self, number: int, answer: RecordsAnswer, now: float) -> list[UpstreamEffect]:
+        """Upstream answered what it was asked or sent."""
+        if number != self._number or self._doing not in ("ask", "send"):
+            return []
+        doing = self._doing
+        self._heard_from(now)
+        self._most_bytes = min(2 * self._most_bytes, MOST_BYTES)
+        if doing == "ask":
+            self._more = answer.more
+            if answer.records:
+                self._begin("put")
+                return [PutIn(self._number, self.place, answer.records, answer.place)]
+            self._must_ask, self._unsure = False, self.place.record
+        elif answer.same:
+            self.place, self._must_ask = answer.place, False
+        else:
+            self._must_ask = True
+        return self._go_on(now)
+
+    def put(self, number: int, place: JournalPlace, head: int, now: float) -> list[UpstreamEffect]:
+        """What came from upstream is in the journal, up to `place`, and the journal ends at `head`."""
+        if number != self._number or self._doing != "put":
+            return []
+        self._doing = ""
+        self.place, self.head, self._must_ask = place, head, self._more
+        self._unsure = max(self._unsure, head) if self._more else place.record
+        return self._go_on(now)
+
+    def refused(self, number: int, problem: Any, now: float) -> list[UpstreamEffect]:
+        """Upstream refused; or what came from it could not be put in."""
+        if number != self._number or not self._doing:
+            return []
+        doing, self._doing, self._must_ask = self._doing, "", True
+        if doing != "put":
+            self._heard_from(now)
+        if problem.code == "records_moved_on" and doing == "send":
+            return self._go_on(now)
+        if problem.code == "other_records" and self.place.record:
+            self.place, self._unsure = JournalPlace(), self.head
+            return self._go_on(now)
+        if problem.code == "unknown_map":
+            self._joined = False
+        if problem.code in _RETRIED or (problem.code == "unknown_map" and doing != "join"):
+            self._wait(now)
+        else:
+            self.problem, self._not_before = problem, now + REFUSED_S
+        return []
+
+    def silent(self, number: int, timed_out: bool, now: float) -> list[UpstreamEffect]:
+        """No answer came.  timed_out: none in time; the link may be slow."""
+        if number != self._number or not self._doing:
+            return []
+        self._lost(now)
+        if timed_out:
+            self._most_bytes = max(self._most_bytes // 4, LEAST_BYTES)
+        self._wait(now)
+        return []
+
+    def _go_on(self, now: float) -> list[UpstreamEffect]:
+        if not self._alive or self._doing or now < self._not_before:
+            return []
+        if not self._joined:
+            self._begin("join")
+            return [JoinUpstream(self._number)]
+        if self._must_ask or (self.head <= self.place.record and now - self._heard >= POLL_S):
+            self._begin("ask")
+            return [AskUpstream(self._number, self.place, self._unsure, self._most_bytes)]
+        if self.head > self.place.record and now - self._heard >= SEND_S:
+            self._begin("send")
+            return [SendUpstream(self._number, self.place, self._most_bytes)]
+        return []
+
+    def _begin(self, doing: str) -> None:
+        self._number += 1
+        self._doing = doing
+
+    def _heard_from(self, now: float) -> None:
+        self._doing, self._heard, self._pause_s, self.problem = "", now, PAUSES_S[0], None
+        if not self.connected:
+            self.connected, self.since = True, now
+
+    def _lost(self, now: float) -> None:
+        """What is under way may have come through, or not."""
+        if self.connected:
+            self.connected, self.since = False, now
+        if self._doing != "put":  # which needs no link
+            self._doing = ""
+            self._number += 1
+        self._must_ask = True
+
+    def _wait(self, now: float) -> None:
+        self._not_before = now + self._pause_s
+        self._pause_s = min(2 * self._pause_s, PAUSES_S[1])

@@ -1,0 +1,355 @@
+"""A service that is a replica, at work: one thread follows the upstream for all maps.
+
+It asks and sends; what comes is put in by the map's own thread.  A link that is down costs nothing but an attempt to
+open a session now and then; clients here never wait for it.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from factorbus.journal.problems import JournalDamaged, JournalUnreadable
+from factorbus.journal.records import JournalRecord
+from factorbus.journal.rewriting import UpstreamPlace, upstream_of
+from factorbus.journal.store import open_store
+from factorbus.proto import codec, keys
+from factorbus.proto.problems import Problem
+from factorbus.proto.records import (
+    MOST_NAMED,
+    MOST_RECORDS,
+    JournalPlace,
+    RecordsAsk,
+    RecordsPush,
+    decode_records_answer,
+    encode_records_ask,
+    encode_records_push,
+    with_messages,
+)
+from factorbus.service.journal.keeping import Keeper
+from factorbus.service.maps.host import Host
+from factorbus.service.replica.core import (
+    AskUpstream,
+    JoinUpstream,
+    PutIn,
+    SendUpstream,
+    UpstreamCore,
+    UpstreamEffect,
+)
+from factorbus.service.replica.grafting import Graft, Grafted, sent_records
+from factorbus.service.replica.tail import JournalTail
+from factorbus.service.solving.arrival import message_digest
+
+log = logging.getLogger(__name__)
+
+_PATIENCE_S = 10.0  # for one answer
+_SOON_S = 0.001  # a clock that stands still for so long does not make the thread spin
+_OPENING_S = 1.0  # between attempts to open a session
+_NOTHING: frozenset[int] = frozenset()
+
+
+class UpstreamSession(Protocol):
+    """The bus of the upstream.  Calls back on its own threads."""
+
+    def ask(self, key: str, payload: bytes, timeout_s: float, done: Callable[[Any], None]) -> None:
+        """`done` gets the bytes of the answer, a Problem, or None (nobody answered) or False (not in time)."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
+class _LocalAsker:
+    """Stands for a query where the service itself asks: gets a Problem, or what the map made of a graft."""
+
+    key_expr = ""
+
+    def __init__(self, done: Callable[[Any], None]) -> None:
+        self._done = done
+
+    def __enter__(self) -> "_LocalAsker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def reply(self, _key: str, _message: bytes) -> None:
+        """`Graft.heard` has told."""
+
+    def reply_err(self, message: bytes) -> None:
+        """It is refused."""
+        self._done(codec.decode_problem(message))
+
+
+class _Followed:
+    """One map of this service."""
+
+    def __init__(self, host: Host, keeper: Keeper, core: UpstreamCore) -> None:
+        self.host, self.keeper, self.core = host, keeper, core
+        self.tail = JournalTail(keeper)
+        self.behind = self.rebased = self.refused = 0
+        self.same_bits = True
+        self.sent_bytes = self.received_bytes = 0
+
+
+class Replicas:
+    """All maps of a service that is a replica.
+
+    hosts: the maps there are.  open_session: opens the bus of the upstream; it calls what it is given with whether
+    somebody is there.  Raises Problem.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        name: str,
+        hosts: Callable[[], dict[str, Host]],
+        open_session: Callable[[Callable[[bool], None]], UpstreamSession],
+    ) -> None:
+        self._endpoint, self._name, self._hosts, self._open_session = endpoint, name, hosts, open_session
+        self._maps: dict[str, _Followed] = {}
+        self._session: UpstreamSession | None = None
+        self._alive, self._open_at = False, 0.0
+        self._events: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._ticking = False
+        self._thread = threading.Thread(target=self._run, name="upstream", daemon=True)
+        self._thread.start()
+
+    def tick(self) -> None:
+        """Time went by."""
+        if not self._ticking:
+            self._ticking = True
+            self._events.put(self._tick)
+
+    def row(self, name: str) -> dict[str, Any]:
+        """What ask/stats of map `name` says, if it follows."""
+        followed = self._maps.get(name)
+        return {} if followed is None else {"upstream": self._row(followed)}
+
+    def close(self) -> None:
+        """Follow no more."""
+        self._events.put(None)
+        self._thread.join()
+        if self._session is not None:
+            self._session.close()
+
+    def _row(self, followed: _Followed) -> dict[str, Any]:
+        core, problem = followed.core, followed.core.problem
+        return {
+            "endpoint": self._endpoint,
+            "connected": core.connected,
+            "since_s": time.monotonic() - core.since,
+            "behind": followed.behind,
+            "record": core.place.record,
+            "rebased": followed.rebased,
+            "refused": followed.refused,
+            "same_bits": followed.same_bits,
+            "sent_bytes": followed.sent_bytes,
+            "received_bytes": followed.received_bytes,
+            "code": problem.code if problem is not None else "",
+            "problem": str(problem.message) if problem is not None else "",
+        }
+
+    # ---- on the thread ----------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            try:
+                event = self._events.get(timeout=self._due_s())
+            except queue.Empty:
+                event = self._tick_all
+            if event is None:
+                return
+            try:
+                event()
+            except Exception:
+                log.exception("upstream %s: %r failed", self._endpoint, event)
+
+    def _due_s(self) -> float | None:
+        now = time.monotonic()
+        due = [wait_s for followed in self._maps.values() if (wait_s := followed.core.due_s(now)) is not None]
+        return min(due) + _SOON_S if due else None
+
+    def _tick(self) -> None:
+        self._ticking = False
+        now = time.monotonic()
+        if self._session is None and now >= self._open_at:
+            try:
+                self._session = self._open_session(lambda alive: self._events.put(lambda: self._seen(alive)))
+            except Problem as problem:
+                log.debug("upstream %s: %s", self._endpoint, problem)
+                self._open_at = time.monotonic() + _OPENING_S
+        hosts = self._hosts()
+        for name in [name for name, followed in self._maps.items() if hosts.get(name) is not followed.host]:
+            del self._maps[name]
+        for name, host in hosts.items():
+            if name not in self._maps and (keeper := host.keeper) is not None:
+                self._begin(name, host, keeper)
+        self._tick_all()
+
+    def _tick_all(self) -> None:
+        now = time.monotonic()
+        for followed in list(self._maps.values()):
+            self._do(followed, followed.core.tick(now))
+
+    def _begin(self, name: str, host: Host, keeper: Keeper) -> None:
+        """Follow one more map, from where its journal says that both were the same."""
+        # Set first: what is written from here on is heard of, if only when this has been done.
+        keeper.written = lambda records: self._events.put(lambda: self._wrote(name, keeper, records))
+        try:
+            store = open_store(keeper.folder, read_only=True)
+        except Problem as problem:
+            log.error("map %s follows nobody: %s", name, problem)
+            return
+        try:
+            place, last = upstream_of(store), keeper.last
+            if place.record > last.record:  # the end of the journal was lost in a crash
+                place = UpstreamPlace(*JournalPlace())
+            behind = sum(len(record.entries) for record in store.records(place.record))
+        except (JournalDamaged, JournalUnreadable) as problem:
+            log.error("map %s follows nobody: %s", name, problem)
+            return
+        finally:
+            store.close()
+        keeper.upstream = place
+        host.upstream_stats = lambda: self.row(name)
+        followed = _Followed(host, keeper, UpstreamCore(JournalPlace(*place), last.record, time.monotonic()))
+        followed.behind = behind
+        self._maps[name] = followed
+        if self._alive:
+            self._do(followed, followed.core.link(True, time.monotonic()))
+
+    def _seen(self, alive: bool) -> None:
+        if alive != self._alive:
+            log.info("upstream %s is %s", self._endpoint, "there" if alive else "out of reach; going on alone")
+        self._alive = alive
+        for followed in list(self._maps.values()):
+            self._do(followed, followed.core.link(alive, time.monotonic()))
+
+    def _wrote(self, name: str, keeper: Keeper, records: Sequence[JournalRecord] | None) -> None:
+        followed = self._maps.get(name)
+        if followed is None or followed.keeper is not keeper:
+            return
+        if records is None:
+            followed.tail.forget()
+            return
+        records = [record for record in records if record.number > followed.core.head]
+        if not records:
+            return  # known since the journal was read
+        followed.behind += sum(len(record.entries) for record in records)
+        followed.tail.wrote(records)
+        self._do(followed, followed.core.grew(records[-1].number, time.monotonic()))
+
+    def _do(self, followed: _Followed, effects: Sequence[UpstreamEffect]) -> None:
+        for effect in effects:
+            match effect:
+                case JoinUpstream():
+                    self._join(followed, effect)
+                case AskUpstream():
+                    self._ask(followed, effect)
+                case SendUpstream():
+                    self._send(followed, effect)
+                case PutIn():
+                    self._put(followed, effect)
+
+    def _join(self, followed: _Followed, effect: JoinUpstream) -> None:
+        core = followed.host.core
+        payload = codec.encode_map({"map": core.name, "mode": core.mode})
+        self._query(followed, effect.number, keys.admin_key("create"), payload)
+
+    def _ask(self, followed: _Followed, effect: AskUpstream) -> None:
+        named: list[int] = []
+        if effect.unsure > effect.after.record:
+            own = [record for record in followed.tail.after(effect.after.record) if record.number <= effect.unsure]
+            named = [message_digest(entry.message) for record in own for entry in record.entries][:MOST_NAMED]
+        payload = encode_records_ask(RecordsAsk(effect.after, tuple(named), effect.most_bytes))
+        self._query(followed, effect.number, keys.ask_key(followed.host.core.name, "records"), payload)
+
+    def _send(self, followed: _Followed, effect: SendUpstream) -> None:
+        own = followed.tail.after(effect.after.record)
+        records, last, _ = sent_records(own, _NOTHING, effect.most_bytes, MOST_RECORDS)
+        if last is None:
+            return
+        followed.core.sent(effect.number, last.record)
+        payload = encode_records_push(RecordsPush(effect.after, records))
+        inserts = sum(len(record.inserts) for record in records)
+        key = keys.records_key(followed.host.core.name, self._name)
+        self._query(followed, effect.number, key, payload, (inserts, last.chain))
+
+    def _query(
+        self, followed: _Followed, number: int, key: str, payload: bytes, sent: tuple[int, bytes] | None = None
+    ) -> None:
+        followed.sent_bytes += len(payload)
+        if self._session is None:
+            return
+
+        def done(result: Any) -> None:
+            self._events.put(lambda: self._told(followed, number, result, sent))
+
+        self._session.ask(key, payload, _PATIENCE_S, done)
+
+    def _told(self, followed: _Followed, number: int, result: Any, sent: tuple[int, bytes] | None) -> None:
+        core, now = followed.core, time.monotonic()
+        if isinstance(result, Problem):
+            if result.code not in ("records_moved_on", "busy"):
+                log.warning("map %s: upstream %s: %s", followed.host.core.name, self._endpoint, result)
+            self._do(followed, core.refused(number, result, now))
+            return
+        if not isinstance(result, bytes):
+            self._do(followed, core.silent(number, result is False, now))
+            return
+        followed.received_bytes += len(result)
+        if core.joining(number):
+            self._do(followed, core.joined(number, now))
+            return
+        try:
+            answer = decode_records_answer(result, message_digest)
+        except Problem as problem:
+            self._do(followed, core.refused(number, problem, now))
+            return
+        before = core.place
+        effects = core.answered(number, answer, now)
+        if sent is not None and core.place != before:
+            followed.keeper.upstream = UpstreamPlace(*core.place)
+            followed.behind -= sent[0]
+            self._compare(followed, sent[1] == core.place.chain)
+        self._do(followed, effects)
+
+    def _put(self, followed: _Followed, effect: PutIn) -> None:
+        lacking = any(not insert.message for record in effect.records for insert in record.inserts)
+        own = followed.tail.after(effect.after.record) if lacking else []
+        had = {message_digest(entry.message): entry.message for record in own for entry in record.entries}
+        try:
+            records = with_messages(effect.records, had)
+        except Problem as problem:
+            self._do(followed, followed.core.refused(effect.number, problem, time.monotonic()))
+            return
+
+        def heard(grafted: Grafted) -> None:
+            self._events.put(lambda: self._grafted(followed, effect, grafted))
+
+        def refused(problem: Any) -> None:
+            self._events.put(lambda: self._told(followed, effect.number, problem, None))
+
+        graft = Graft(effect.after, records, effect.place, heard)
+        followed.host.graft(_LocalAsker(refused), graft)
+
+    def _grafted(self, followed: _Followed, effect: PutIn, grafted: Grafted) -> None:
+        followed.rebased += bool(grafted.rebased)
+        followed.refused += len(grafted.refused)
+        followed.tail.forget()
+        followed.behind = grafted.behind
+        self._compare(followed, grafted.same_bits)
+        now = time.monotonic()
+        self._do(followed, followed.core.put(effect.number, effect.place, grafted.last.record, now))
+
+    def _compare(self, followed: _Followed, same: bool) -> None:
+        if followed.same_bits and not same:
+            log.warning(
+                "map %s: values have other bits than upstream: another version or machine made them",
+                followed.host.core.name,
+            )
+        followed.same_bits = same
