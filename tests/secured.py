@@ -23,10 +23,12 @@ wall = ["kitchen"]
 w1 = []
 [operator]
 ops = ["*"]
+[replica]
+boat = ["hall"]
 [service]
 solver = ["*"]
 """
-NAMES = ("robot1", "robot2", "wall", "w1", "ops")
+NAMES = ("robot1", "robot2", "wall", "w1", "ops", "boat")
 
 
 class Secured:

@@ -28,7 +28,7 @@ def test_every_name_gets_rules_of_its_own() -> None:
 
 def test_every_key_is_one_that_zenoh_takes() -> None:
     roles = "".join(
-        f'[{role}]\n{role}1 = ["a", "b-*", "*"]\n' for role in ("front_end", "viewer", "operator", "service")
+        f'[{role}]\n{role}1 = ["a", "b-*", "*"]\n' for role in ("front_end", "viewer", "operator", "replica", "service")
     )
     for rule in access_control(read_grants(roles + "[worker]\nw1 = []\n[router]\nr1 = []\n"))["rules"]:
         for key in rule["key_exprs"]:

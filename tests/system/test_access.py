@@ -40,11 +40,11 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., 
 
 
 @pytest.fixture(scope="module")
-def hub(secured: Secured, started: Callable[..., Process]) -> str:
-    """A service that listens with TLS, keeps two maps, and has a worker."""
+def hub(secured: Secured, started: Callable[..., Process], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A service that listens with TLS, keeps two maps in a journal, and has a worker."""
     service = started(
         "-m", "factorbus.service", "--listen", "tls/127.0.0.1:0", "--zenoh", str(secured.server), "--name", "s1",
-        "--create", "kitchen", "--create", "hall",
+        "--create", "kitchen", "--create", "hall", "--journal", str(tmp_path_factory.mktemp("journal")),
     )  # fmt: skip
     endpoint = service.ready()[0]
     worker = started(
@@ -146,15 +146,24 @@ TRIALS: dict[str, tuple[Callable[[Identity], bool], tuple[str, ...]]] = {
     },
     **{
         f"ask hall for {question}": (
-            lambda me, question=question: me.answered(f"map/hall/ask/{question}"), ("robot2", "ops")
+            lambda me, question=question: me.answered(f"map/hall/ask/{question}"),
+            ("robot2", "ops", "boat") if question == "records" else ("robot2", "ops"),
         )
         for question in keys.QUESTIONS
+    },
+    **{
+        f"send records of {name} as {who}": (
+            lambda me, name=name, who=who: me.answered(f"map/{name}/records/{who}"),
+            ("boat",) if (name, who) == ("hall", "boat") else (),
+        )
+        for name in ("kitchen", "hall")
+        for who in ("boat", "robot2", "*")
     },
     "ask every map": (lambda me: me.answered("map/*/ask/stats"), ("ops",)),
     "ask everything": (lambda me: me.answered("**"), ()),
     "list maps": (lambda me: me.answered("admin/maps"), ("ops",)),
     "read the service's statistics": (lambda me: me.answered("admin/stats"), ("ops",)),
-    "create a map": (lambda me: me.answered("admin/create", CREATE), ("ops",)),
+    "create a map": (lambda me: me.answered("admin/create", CREATE), ("ops", "boat")),
     "drop a map": (lambda me: me.answered("admin/drop", codec.encode_map({"map": "none"})), ("ops",)),
     "fork a map": (lambda me: me.answered("admin/fork", codec.encode_map({"map": "none", "as": "n"})), ("ops",)),
     "any operation": (lambda me: me.answered("admin/**"), ()),
@@ -174,7 +183,7 @@ TRIALS: dict[str, tuple[Callable[[Identity], bool], tuple[str, ...]]] = {
     ),
     "see who keeps hall": (lambda me: me.sees("map/hall/live/service/*"), ("robot2", "ops")),
     "see workers": (lambda me: me.sees("worker/*/live/*"), ("ops",)),
-    "see who makes features": (lambda me: me.sees("features/*/live"), ("robot1", "robot2", "wall", "ops")),
+    "see who makes features": (lambda me: me.sees("features/*/live"), ("robot1", "robot2", "wall", "ops", "boat")),
     **{
         f"be seen in kitchen as {who}": (
             lambda me, who=who: me.seen(f"map/kitchen/live/client/{who}-{me.name}"), (who,)
@@ -255,3 +264,33 @@ def test_nothing_of_what_was_tried_changed_the_map(identities: dict[str, Identit
     )
     estimate = codec.decode_estimate(ops.estimate("hall"))
     assert sum(len(group.keys) for group in estimate.variables) == 2
+
+
+def test_a_replica_follows_over_tls_in_its_role(
+    secured: Secured, hub: str, started: Callable[..., Process], tmp_path: Path
+) -> None:
+    upstream = ("--upstream", hub, "--upstream-zenoh", str(secured.clients["boat"]))
+    journal = ("--journal", str(tmp_path / "journal"))
+    replica = started(
+        "-m",
+        "factorbus.service",
+        "--listen",
+        "tcp/127.0.0.1:0",
+        "--name",
+        "boat",
+        "--create",
+        "hall",
+        *journal,
+        *upstream,
+    )
+    with (
+        connect(replica.ready()[0], client="front", timeout_s=ALLOWED_S) as aboard,
+        connect(hub, client="ops", zenoh=secured.clients["ops"], timeout_s=ALLOWED_S) as ops,
+        aboard.map("hall", create=False) as driven,
+        ops.map("hall", create=False) as followed,
+    ):
+        driven.insert(Draft().se2("b0", (1, 2, 0.5), fixed=True))
+        end = time.monotonic() + ALLOWED_S
+        while "b0" not in followed.estimate:
+            assert time.monotonic() < end, replica.errors()
+            time.sleep(0.05)  # what a mirror has is told to callbacks, not to the test

@@ -196,6 +196,7 @@ def test_the_ready_configurations_are_what_the_command_makes(tmp_path: Path) -> 
         "viewer1.json5": ("--client", "viewer1"),
         "worker1.json5": ("--client", "worker1"),
         "operator1.json5": ("--client", "operator1"),
+        "boat1.json5": ("--client", "boat1"),
     }.items():
         made = tmp_path / name
         subprocess.run([*command, str(made), *options], check=True, timeout=60)

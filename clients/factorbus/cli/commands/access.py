@@ -23,7 +23,9 @@ from factorbus.cli.process.options import file_argument, out_option
 def command(file: Path, certificates: str, name: str, users: str, client: str, out: Path | None) -> None:
     """Write the Zenoh configuration that lets everybody in FILE.toml do their part, and nobody else anything.
 
-    The file has a table for each role: front_end, viewer, worker, operator, and at a router also service and router.
+    The file has a table for each role: front_end, viewer, worker, operator, replica, and at a router also service and
+    router.
+
     A name is the common name of a certificate (deploy/zenoh/certificates.sh), or with --users a user with a password.
     Give the result to `factorbus serve --zenoh`, or to the Zenoh router that everybody connects to.
 

@@ -5,6 +5,7 @@
     viewer       ask and follow its maps
     worker       take jobs under its own name
     operator     all that a viewer may, the set of maps (list, create, fork, drop, stats), and insert under its own name
+    replica      follow its maps as a service that has the same, create them, and send their records under its own name
     service      keep its maps: needed where services meet clients at a router
     router       everything: another router of the same fabric
 
@@ -26,7 +27,7 @@ from typing import Any, NamedTuple
 from factorbus.proto.keys import ANY_SERVICE_OF_ANY_VERSION, PREFIX
 from factorbus.service.config import BadConfig
 
-ROLES = ("front_end", "viewer", "worker", "operator", "service", "router")
+ROLES = ("front_end", "viewer", "worker", "operator", "replica", "service", "router")
 _WITHOUT_MAPS = ("worker", "router")
 _NAME = re.compile(r"[A-Za-z0-9_]{1,55}")
 _PATTERN = re.compile(r"\*|[A-Za-z0-9_-]{1,64}|[A-Za-z0-9_-]{1,63}\*")
@@ -149,8 +150,15 @@ def _worker(grant: Grant) -> Iterator[AccessRule]:
     yield AccessRule("ingress", _BE_SEEN, alive)
 
 
+def _replica(grant: Grant) -> Iterator[AccessRule]:
+    sent = (key for each in _of_maps(grant, "records/") for key in _own(each, grant.name, ""))
+    yield from _exchange(*_of_maps(grant, "ask/records"), *sent, f"{PREFIX}/admin/create")
+    yield from _sees(f"{PREFIX}/features/*/live")
+
+
 def _service(grant: Grant) -> Iterator[AccessRule]:
-    answered = (*_of_maps(grant, "in/*"), *_of_maps(grant, "ask/*"), f"{PREFIX}/admin/*", f"{PREFIX}/features/*/ask")
+    maps = (key for below in ("in/*", "ask/*", "records/*") for key in _of_maps(grant, below))
+    answered = (*maps, f"{PREFIX}/admin/*", f"{PREFIX}/features/*/ask")
     alive = (*_of_maps(grant, "live/service/*"), f"{PREFIX}/features/*/live")
     yield AccessRule("ingress", _ANSWER, answered)
     yield AccessRule("egress", _ASK, answered)
@@ -212,6 +220,7 @@ _RULES: Mapping[str, Callable[[Grant], Iterator[AccessRule]]] = {
     "viewer": _viewer,
     "worker": _worker,
     "operator": _operator,
+    "replica": _replica,
     "service": _service,
     "router": _router,
 }
