@@ -81,8 +81,9 @@ def known(said: Any, described: Any) -> Any:
         return [known(*pair) for pair in zip(said, described, strict=True)]
     if not (isinstance(said, dict) and isinstance(described, dict)):
         return said
-    if set(said) == {"f64"} and set(described) == {"i64"}:
-        return {"i64": np.array(said["f64"]).view(np.int64).tolist()}
+    for name, dtype in (("i64", np.int64), ("u8", np.uint8)):
+        if set(said) == {"f64"} and set(described) == {name}:
+            return {name: np.array(said["f64"]).view(dtype).tolist()}
     return {name: known(each, described.get(name)) for name, each in said.items()}
 
 

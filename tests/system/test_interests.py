@@ -208,8 +208,9 @@ def test_stats_and_top_say_what_each_channel_carries(bus: Bus, viewer: Bus, endp
         follow(part, drive(whole, 0, 4))
         said = command("stats", "told", endpoint)
         assert re.search(r"interest in told.*x; box 0 0 9 9, every 100 ms, at most 5,000 bytes a second: ", said)
-        (row,) = json.loads(command("top", "--once", "--json", endpoint))["interests"]
-        assert (row["map"], row["letters"], row["waiting"]) == ("told", ["x"], 0)
+        rows = json.loads(command("top", "--once", "--json", endpoint))["interests"]
+        (row,) = (each for each in rows if each["map"] == "told")  # those of other maps end a little later
+        assert (row["letters"], row["waiting"]) == (["x"], 0)
         assert row["bytes"] > 0
         assert "box 0 0 9 9" in command("top", "--once", endpoint)
 

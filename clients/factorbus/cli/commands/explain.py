@@ -16,7 +16,7 @@ _CODES = {
     "apart": "not_positive_definite", "bad_configuration_file": "bad_file", "broken": "internal",
     "closed_here": "unavailable", "interest_ended": "busy", "no_mirror": "unavailable",
     "not_finite_numbers": "not_finite",
-    "not_held": "unknown_variable", "not_reached": "unavailable",
+    "not_held": "unknown_variable", "not_recorded": "no_journal", "not_reached": "unavailable",
     "dataset_problem": "problem", "format_error": "bad_file",
     "bad_recording": "bad_file",
     "map_there": "map_exists", "no_pose": "unknown_variable", "nobody_listens": "unavailable",
