@@ -21,10 +21,10 @@ from factorbus.proto.records import JournalPlace
 from factorbus.service.config import Config, Limits
 from factorbus.service.core.events import Answer, Effect, Publish, Refuse
 from factorbus.service.core.map_state import MapCore
+from factorbus.service.journal.grafting import Graft, Grafted, sent_records
 from factorbus.service.journal.keeping import Keeper
 from factorbus.service.journal.library import Library, log_owner, open_library
 from factorbus.service.maps.host import Host
-from factorbus.service.replica.grafting import Graft, Grafted, sent_records
 from factorbus.service.solving.arrival import read_insert
 
 PATIENCE_S = 60.0

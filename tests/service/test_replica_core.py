@@ -12,8 +12,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 from factorbus.proto.problems import Busy, Problem
 from factorbus.proto.records import JournalPlace, RecordsAnswer, SentInsert, SentRecord
+from factorbus.service.journal.record_problems import OtherRecords, RecordsMovedOn
 from factorbus.service.replica.core import AskUpstream, JoinUpstream, PutIn, SendUpstream, UpstreamCore
-from factorbus.service.replica.problems import OtherRecords, RecordsMovedOn
 
 MOST = 5  # records that one message of the models takes
 

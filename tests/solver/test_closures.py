@@ -82,8 +82,8 @@ def allowed(P: np.ndarray, noise: np.ndarray) -> np.ndarray:
     d = len(P)
     size = d // 3 + 1
     out = P + noise
-    bend = 0.75 * np.linalg.eigvalsh(P[:size, :size])[-1] * np.linalg.eigvalsh(P[size:, size:])[-1]
-    out[:size, :size] += bend * np.eye(size)
+    second_order = 0.75 * np.linalg.eigvalsh(P[:size, :size])[-1] * np.linalg.eigvalsh(P[size:, size:])[-1]
+    out[:size, :size] += second_order * np.eye(size)
     return out
 
 

@@ -293,4 +293,4 @@ def test_a_replica_follows_over_tls_in_its_role(
         end = time.monotonic() + ALLOWED_S
         while "b0" not in followed.estimate:
             assert time.monotonic() < end, replica.errors()
-            time.sleep(0.05)  # what a mirror has is told to callbacks, not to the test
+            time.sleep(0.05)  # a mirror notifies callbacks, not the test

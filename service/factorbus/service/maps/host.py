@@ -39,11 +39,11 @@ from factorbus.service.core.events import (
 )
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.core.pending_questions import is_graft
+from factorbus.service.journal.grafting import Graft, graft_records
 from factorbus.service.journal.keeping import Events, Keeper, Keeping
+from factorbus.service.journal.record_problems import NotRecorded
 from factorbus.service.process.health import Pulse
 from factorbus.service.questions.answers import Question, QuestionCopies
-from factorbus.service.replica.grafting import Graft, graft_records
-from factorbus.service.replica.problems import NotRecorded
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.errors import SolverError
 

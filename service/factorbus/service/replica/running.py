@@ -28,6 +28,7 @@ from factorbus.proto.records import (
     encode_records_push,
     with_messages,
 )
+from factorbus.service.journal.grafting import Graft, Grafted, sent_records
 from factorbus.service.journal.keeping import Keeper
 from factorbus.service.maps.host import Host
 from factorbus.service.replica.core import (
@@ -38,7 +39,6 @@ from factorbus.service.replica.core import (
     UpstreamCore,
     UpstreamEffect,
 )
-from factorbus.service.replica.grafting import Graft, Grafted, sent_records
 from factorbus.service.replica.tail import JournalTail
 from factorbus.service.solving.arrival import message_digest
 

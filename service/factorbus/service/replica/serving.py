@@ -18,11 +18,11 @@ from factorbus.proto.records import (
 )
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Asker
+from factorbus.service.journal.grafting import Graft, sent_records
 from factorbus.service.journal.keeping import Keeper
+from factorbus.service.journal.record_problems import NotRecorded, OtherRecords
 from factorbus.service.maps.host import Host
 from factorbus.service.maps.serial_executor import SerialExecutor
-from factorbus.service.replica.grafting import Graft, sent_records
-from factorbus.service.replica.problems import NotRecorded, OtherRecords
 from factorbus.service.solving.arrival import message_digest
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 class RecordServing:
     """Questions for records, and records of replicas, on a thread of their own.
 
-    reply, refuse: answer a query.  no_room: why what has so many bytes cannot be taken, if there is a reason.
+    reply, refuse: answer a query.  no_room: why a message of that many bytes cannot be taken, if there is a reason.
     """
 
     def __init__(

@@ -7,8 +7,8 @@
 Two closures agree if the loop z_i⁻¹ (A_i⁻¹ A_j) z_j (B_j⁻¹ B_i) comes back to where it began, within the quantile: what
 the map is wrong in alike at both is not in it.
 
-First order is not enough where a map is uncertain: over a lever that makes σ_p of a heading σ_θ the end bends away by
-σ_p σ_θ / 2, which is added to what is allowed along every axis, squared, with E θ⁴ = 3 σ_θ⁴.
+First order is not enough where a map is uncertain: over a lever that makes σ_p of a heading σ_θ the second-order term
+of the position is σ_p θ² / (2 σ_θ); its mean square, with E θ⁴ = 3 σ_θ⁴, is added to the variance along every axis.
 
 A closure that is false may agree by chance.  Its chance to do so is the share that the gate takes of where false ones
 are: up to `spread_m` off along each axis, and `spread_rad` about each.
@@ -23,7 +23,7 @@ import numpy as np
 from factorbus.solver.closures.motions import adjoint_motion, inverse_motion, tangent_of
 from factorbus.solver.kernels.jit.compile import F64, I64
 
-_BEND = 0.75  # of σ_p² σ_θ²
+_SECOND_ORDER = 0.75  # of σ_p² σ_θ²
 _HELD = 1e-3  # a share of Ω⁻¹: below, the map is what the closure says
 
 
@@ -62,7 +62,7 @@ def judge_each(c: ClosureNumbers, quantile: float, spreads: Sequence[FalseSpread
     r = tangent_of(inverse_motion(c.z) @ there)
     J = np.concatenate([-adjoint_motion(inverse_motion(there)), np.broadcast_to(np.eye(d), (n, d, d))], axis=-1)
     blocks = c.known.reshape(n, 2 * d, n, 2 * d)[np.arange(n), :, np.arange(n)]
-    S = c.noise + _bent(J @ blocks @ J.swapaxes(1, 2))
+    S = c.noise + _with_second_order(J @ blocks @ J.swapaxes(1, 2))
     return Evidence(_squared(r, S), _chances(S, quantile, spreads))
 
 
@@ -77,7 +77,7 @@ def judge_pairs(c: ClosureNumbers, i: I64, j: I64, quantile: float, spreads: Seq
     blocks = c.known.reshape(-1, 2 * d, len(c.z), 2 * d)
     rows = [np.concatenate([blocks[p, :, q] for q in (i, j)], axis=-1) for p in (i, j)]
     S = c.noise[i] + back @ c.noise[j] @ back.swapaxes(1, 2)
-    S += _bent(J @ np.concatenate(rows, axis=-2) @ J.swapaxes(1, 2))
+    S += _with_second_order(J @ np.concatenate(rows, axis=-2) @ J.swapaxes(1, 2))
     return Evidence(_squared(tangent_of(loop), S), _chances(S, quantile, spreads))
 
 
@@ -99,11 +99,11 @@ def judge_accepted(c: ClosureNumbers) -> F64:
     return np.where(left > _HELD, y * y / np.maximum(left, _HELD), 0.0).sum(axis=1)
 
 
-def _bent(P: F64) -> F64:
+def _with_second_order(P: F64) -> F64:
     """What is allowed of places (..., d, d), with the second order of headings."""
     place, turn = _axes(P)
     out, each = P.copy(), np.arange(place.shape[-1])
-    out[..., each, each] += _BEND * place[..., -1:] * turn[..., -1:]
+    out[..., each, each] += _SECOND_ORDER * place[..., -1:] * turn[..., -1:]
     return out
 
 

@@ -23,9 +23,9 @@ from factorbus.proto.messages import Insert
 from factorbus.proto.records import JournalPlace, SentInsert, SentRecord
 from factorbus.service.core.events import Stepped
 from factorbus.service.journal.keeping import Keeper
+from factorbus.service.journal.record_problems import FactorsMoved, NumberTaken, RecordsDiffer, RecordsMovedOn
 from factorbus.service.journal.recovery import arrived_again, recover
 from factorbus.service.journal.writing import written
-from factorbus.service.replica.problems import FactorsMoved, NumberTaken, RecordsDiffer, RecordsMovedOn
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import message_digest, read_again
 
