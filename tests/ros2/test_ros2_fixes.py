@@ -203,6 +203,20 @@ def test_an_antenna_that_nothing_places_is_in_the_middle_and_that_is_said() -> N
     assert sum("nothing says where frame 'gps' is" in text for text in robot.said) == 10
 
 
+@pytest.mark.parametrize("told", [3, 6])
+def test_where_an_antenna_is_may_be_told_after_its_first_fixes(told: int) -> None:
+    """As on a machine that is busy, where the static transform is not the first to come."""
+    robot, drafts = Robot(antenna=False), list[Draft | None]()
+    for n in range(8):
+        if n == told:
+            robot.front_end.static("/tf_static", read(TRANSFORMS, static("gps", (0.5, 0.2, 1.0))))
+        drafts += [robot.odometry(n), robot.fix(n)]
+    groups = [group for draft in drafts if draft is not None for group in draft.batch().factors]
+    levers = [row[2:] for group in groups if group.kind == "position_se2_frame" for row in group.measured]
+    assert_allclose(levers, [[0.5, 0.2]] * 8, atol=1e-9)
+    assert not any("nothing says" in text for text in robot.said)
+
+
 def test_a_robot_that_stands_still_collects_but_does_not_align() -> None:
     robot = Robot()
     robot.odometry(0)

@@ -52,9 +52,10 @@ class Bridge:
         self._markers = node.publisher(self._topic(settings.markers, MARKERS, 1))
         self._pose = node.publisher(self._topic(settings.pose, POSE, 1))
         self._forget = joined.estimate.on_delta(self._on_delta)
+        # First, so that what sensors say is not read before what says where they are.
+        self._listen(node, self._topic(STATIC, TRANSFORMS, _STATIC_DEPTH), kept=True)
         for name, type_name in settings.inputs().items():
             self._listen(node, self._topic(name, type_name, 10))
-        self._listen(node, self._topic(STATIC, TRANSFORMS, _STATIC_DEPTH), kept=True)
         if self._front_end.waits_for_pose:
             log.warning("waiting for a pose on %s: %s", " or ".join(settings.poses), self._why_wait())
 

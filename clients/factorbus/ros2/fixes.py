@@ -13,7 +13,7 @@ last keyframe before it: where the antenna was from there, by odometry, is its l
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,19 +50,25 @@ class Fix:
 class Antenna:
     """Where an antenna was at a fix: in the frame of its keyframe, and in the map by odometry alone.
 
-    variance: what odometry since the keyframe adds in any direction, m².
+    variance: what odometry since the keyframe adds in any direction, m².  unplaced: says that nothing tells where its
+    frame is on the robot, in whose middle it is then; empty: it is told.
     """
 
     key: int
     lever: F64
     in_map: F64
     variance: float
+    unplaced: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
+    """place: computes the antenna by what is known now of where its frame is on the robot."""
+
+    topic: str
     fix: Fix
     antenna: Antenna
+    place: Callable[[], Antenna]
 
 
 def read_fix(topic: str, message: Any, sigma_m: float, axes: tuple[int, ...], notes: Notes) -> Fix | None:
@@ -129,17 +135,18 @@ class GnssFixes:
         kept = [each for each in self._collected if present(each.antenna.key)]
         self._collected = deque(kept, _COLLECTED)
 
-    def use(self, topic: str, fix: Fix, antenna: Antenna, draft: Draft) -> None:
-        """A fix, where the antenna was by odometry; once the frame is known it goes into the draft.
+    def use(self, topic: str, fix: Fix, place: Callable[[], Antenna], draft: Draft) -> None:
+        """A fix; place: where the antenna was by odometry.  Once the frame is known it goes into the draft.
 
         Raises BadRosMessage.
         """
+        antenna = place()
         self._counts = Counter({name: count for name, count in self._counts.items() if name[1] >= antenna.key})
         self._counts[topic, antenna.key] += 1
         if self._counts[topic, antenna.key] > _EACH_KEYFRAME:
             self._notes.remark(topic, f"more than {_EACH_KEYFRAME} fixes at one keyframe: left out")
             return
-        placed = _Placed(fix, antenna)
+        placed = _Placed(topic, fix, antenna, place)
         if self._origin is None or self._is_elsewhere(placed):
             self._origin = fix.place
             self._collected.clear()
@@ -181,11 +188,16 @@ class GnssFixes:
     def _insert(self, placed: _Placed, draft: Draft) -> None:
         axes = list(self._space.point_axes)
         antenna, weight = placed.antenna, self._information(placed)
+        if antenna.unplaced:
+            self._notes.remark(placed.topic, antenna.unplaced)
         measured, lever = self._enu(placed)[axes], antenna.lever[axes]
         add = draft.position_se2 if self._space.flat else draft.position_se3
         add(antenna.key, measured, lever=lever, frame=self._frame, information=weight)
 
     def _insert_frame(self, topic: str, draft: Draft) -> None:
+        # A static transform may come after the first fixes, on a machine that is busy.
+        known = (replace(each, antenna=each.place()) if each.antenna.unplaced else each for each in self._collected)
+        self._collected = deque(known, _COLLECTED)
         T, rms = self._aligned()
         row = self._space.row(T)
         draft.variable(self._space.pose, self._frame, row)

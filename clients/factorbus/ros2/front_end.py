@@ -332,27 +332,29 @@ class FrontEnd:
         place = self._track.try_place(stamp_ns)
         if place is None:
             raise BadRosMessage(topic, "a fix from before the first keyframe", "one from after it")
-        at = self._lever(topic, message.header.frame_id)
-        lever = place.T.R @ at + place.T.t
-        T = self._T_map_odom @ place.keyframe.T_odom_base
-        variance = 0.0
-        if _moves(place):
-            J = np.hstack([np.eye(3), -cross_matrix(at)])
-            variance = float(np.linalg.eigvalsh(J @ self._floored_way(place) @ J.T)[-1])
-        antenna = Antenna(place.keyframe.key, lever, T.R @ lever + T.t, variance)
+        T, way = self._T_map_odom @ place.keyframe.T_odom_base, self._floored_way(place) if _moves(place) else None
+        frame, key = message.header.frame_id, place.keyframe.key
+
+        def antenna() -> Antenna:
+            at, unplaced = self._lever(frame)
+            lever, variance = place.T.R @ at + place.T.t, 0.0
+            if way is not None:
+                J = np.hstack([np.eye(3), -cross_matrix(at)])
+                variance = float(np.linalg.eigvalsh(J @ way @ J.T)[-1])
+            return Antenna(key, lever, T.R @ lever + T.t, variance, unplaced)
+
         self._fixes.use(topic, fix, antenna, draft)
 
     def _try_mount(self, frame: str) -> Transform | None:
         return self._mounts.try_mount(self.base_frame, frame)
 
-    def _lever(self, topic: str, frame: str) -> F64:
-        """Where the antenna is on the robot; in its middle where nothing says where its frame is."""
+    def _lever(self, frame: str) -> tuple[F64, str]:
+        """Where the antenna is on the robot; in its middle, and why, where nothing says where its frame is."""
         mount = self._mounts.try_mount(self.base_frame, frame)
         if mount is None:
             text = f"nothing says where frame {frame[:80]!r} is: the antenna is taken to be at {self.base_frame[:80]!r}"
-            self._notes.remark(topic, f"{text} (--mount)")
-            return np.zeros(3)
-        return mount.t
+            return np.zeros(3), f"{text} (--mount)"
+        return mount.t, ""
 
     def _try_node_place(self, topic: str, stamp_ns: int) -> NodePlace | None:
         """Where a node of a graph is, as `GraphClosures` wants it."""

@@ -12,6 +12,8 @@ from zenoh.handlers import Callback
 from factorbus.client.link import open_session
 from factorbus.ros2.names import NodeName, Topic, attachment, gid, read_attachment
 
+_KEPT_S = 5.0  # for publishers to say what they have kept
+
 
 class Node:
     """One node, seen by others from its token on.  Close it, or use it in `with`."""
@@ -39,7 +41,8 @@ class Node:
     def subscribe(self, topic: Topic, hear: Callable[[bytes], None], kept: bool = False) -> None:
         """From now on every message on a topic goes to `hear`, on Zenoh's thread: it may only hand over.
 
-        kept: and those that its publishers have kept for who comes late (transient local).
+        kept: and those that its publishers have kept for who comes late (transient local).  Those of the publishers
+        that are there already have gone to `hear` when this returns, unless one takes longer than `_KEPT_S` to answer.
         """
 
         def on_sample(sample: zenoh.Sample) -> None:
@@ -49,9 +52,24 @@ class Node:
         if kept:
             history = HistoryConfig(detect_late_publishers=True, max_samples=topic.depth)
             self._declared.append(declare_advanced_subscriber(self._session, key, handler, history=history))
+            self._wait_for_kept(key, topic.depth, hear)
         else:
             self._declared.append(self._session.declare_subscriber(key, handler))
         self._announce("MS", topic, kept)
+
+    def _wait_for_kept(self, key: str, depth: int, hear: Callable[[bytes], None]) -> None:
+        """Ask as the subscriber itself has asked, which does not say when it has been answered: what is published
+        after this would be used without what was published long before it."""
+        replies = self._session.get(
+            f"{key}/@adv/**?_max={depth}",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=_KEPT_S,
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                hear(reply.ok.payload.to_bytes())
 
     @property
     def full_name(self) -> str:
