@@ -67,8 +67,12 @@ WRONG = {
     "offset missing": ("EDGE_SE3_TRACKXYZ 0 1 3 1 2 3 1 0 0 1 0 1\n", 1, "parameter 3, which no line declares"),
     "sigma": ("BR 0 1 0.1 4 0 1\n", 1, "standard deviations"),
     "range": ("BR 0 1 0.1 -4 1 1\n", 1, "range -4"),
-    "records of TORO and g2o": (f"EQUIV 0 1\n{GOOD}", 2, "EDGE_SE2, a record of g2o, in what is read as toro text"),
-    "records of g2o and iSAM": (f"{GOOD}ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n", 1, "--dialect g2o to read its alone"),
+    "records of TORO and g2o": (
+        f"EQUIV 0 1\n{GOOD}",
+        2,
+        "EDGE_SE2, a record of g2o and slam++, in what is read as toro text",
+    ),
+    "records of g2o and iSAM": (f"{GOOD}ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n", 1, "--dialect slam++, which has them all"),
     "zero byte": (f"{GOOD}EDGE_SE2 0 1 1 0 0 1\x00\n", 2, "a zero byte"),
 }
 

@@ -228,6 +228,27 @@ def test_isam_is_assumed_and_slampp_can_be_said(tmp_path: Path) -> None:
     assert "--dialect toro" in graph.notes[0]
 
 
+@pytest.mark.parametrize("landmark", ["LANDMARK2", "LANDMARK2:XY", "LANDMARK"])
+def test_slampp_has_the_names_of_g2o_too(tmp_path: Path, landmark: str) -> None:
+    """As its parser has them: EDGE_SE2 is EDGE2, and EDGE_SE2_XY is LANDMARK."""
+    text = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0.1 45 0 0 45 0 400\n"
+    text += f"{landmark} 0 3 2 1 10 2 10\nEDGE_SE2_XY 1 3 1 1 10 2 10\n"
+    if landmark == "LANDMARK":  # iSAM has it, too, and means square roots
+        with pytest.raises(FormatError, match=r"--dialect slam\+\+, which has them all"):
+            read_text(tmp_path, text)
+        graph = read_text(tmp_path, text, dialect="slam++")
+    else:
+        graph = read_text(tmp_path, text)
+    assert graph.dialect == "slam++"
+    (landmarks,) = [group for group in graph.batch.factors if group.kind == "landmark_se2"]
+    np.testing.assert_array_equal(landmarks.information, [[10, 2, 10]] * 2)
+
+
+def test_edges_of_two_dialects_that_weigh_differently_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"a record of g2o and slam\+\+"):
+        read_text(tmp_path, loop() + "EDGE2 0 2 2 0 0 45 1 1 45 1 400\n")
+
+
 def test_what_only_one_bearing_sees_is_in_no_step(tmp_path: Path) -> None:
     graph = read_text(tmp_path, loop() + "VERTEX_XY 9 1 1\nEDGE_BEARING_SE2_XY 0 9 0.5 100\n")
     assert graph.left_out == {"points": 1}

@@ -150,16 +150,14 @@ def _edges(
 
 def _refuse_mixed(file: str, dialect: Dialect, buckets: Mapping[str, Bucket]) -> None:
     """Refuse a file of no named dialect that has vertices or edges of two.  Raises FormatError."""
+    with_all = [other.name for other in DIALECTS.values() if set(buckets) <= set(other.names)]
     for name in sorted(buckets, key=lambda name: buckets[name].numbers[0]):
         others = [other.name for other in DIALECTS.values() if name in other.vertices or name in other.edges]
         if others and name not in dialect.names and name not in dialect.refused:
             seen = f"{name}, a record of {' and '.join(others)}, in what is read as {dialect.name} text"
-            raise FormatError(
-                file,
-                buckets[name].numbers[0],
-                seen,
-                f"records of one dialect, or --dialect {others[0]} to read its alone",
-            )
+            instead = f"{with_all[0]}, which has them all" if with_all else f"{others[0]} to read its alone"
+            wanted = f"records of one dialect, or --dialect {instead}"
+            raise FormatError(file, buckets[name].numbers[0], seen, wanted)
 
 
 def _leave_foreign(file: str, dialect: Dialect, buckets: Mapping[str, Bucket], left: LeftOut) -> None:

@@ -178,15 +178,19 @@ ISAM = Dialect(
     one_numbering=False,
 )
 
+# Its parser has g2o's names of the plane, too, with the same numbers.
 SLAMPP = Dialect(
     "slam++",
-    vertices={"VERTEX2": Vertex("se2"), "VERTEX": Vertex("se2")},
+    vertices={"VERTEX2": Vertex("se2"), "VERTEX": Vertex("se2"), "VERTEX_SE2": Vertex("se2")},
     edges={
         "ODOMETRY": Edge("between_se2"),
         "EDGE2": Edge("between_se2"),
         "EDGE": Edge("between_se2"),
+        "EDGE_SE2": Edge("between_se2"),
         "LANDMARK": Edge("landmark_se2"),
         "LANDMARK2": Edge("landmark_se2"),
+        "LANDMARK2:XY": Edge("landmark_se2"),
+        "EDGE_SE2_XY": Edge("landmark_se2"),
     },
     refused={"EDGE3": _SLAMPP_3D, "EDGE3:AXISANGLE": _SLAMPP_3D},
 )

@@ -10,7 +10,7 @@ from factorbus.formats.records import DIALECTS, G2O, ISAM, SLAMPP, TORO, Dialect
 
 _TORO_ONLY = {"VERTEX", "VERTEX3", "EDGE", "EQUIV", "BR"}
 _ISAM_TOO = {"ODOMETRY", "LANDMARK"}  # iSAM has them, and so has SLAM++
-_SLAMPP_ONLY = {"LANDMARK2", "EDGE3:AXISANGLE"}
+_SLAMPP_ONLY = {"LANDMARK2", "LANDMARK2:XY", "EDGE3:AXISANGLE"}
 _TORO_YY, _TORO_TT = 7, 8  # fields of an EDGE2 that are on the diagonal in TORO, and mostly 0 elsewhere
 
 
