@@ -99,10 +99,12 @@ def amcl(ns: int = START_NS + 10**9) -> Said:
     return Said("/amcl_pose", POSE, ns, ros.known_pose(ns, (9.0, 9.0, 0.0), [0.01] * 6))
 
 
-def write_mcap(path: Path, said: Iterable[Said], compression: CompressionType = CompressionType.ZSTD) -> Path:
+def write_mcap(
+    path: Path, said: Iterable[Said], compression: CompressionType = CompressionType.ZSTD, chunk_size: int = 4096
+) -> Path:
     """Small chunks, so that a file that is cut off has some."""
     with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=4096, compression=compression)
+        writer = Writer(stream, chunk_size=chunk_size, compression=compression)
         writer.start("ros2", "tests")
         channels: dict[tuple[str, str], int] = {}
         for number, each in enumerate(said):

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import StoragePlugin
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import BAD_FILE, OK, USAGE
 from factorbus.proto.messages import Batch
-from factorbus.ros2.messages import ODOMETRY
+from factorbus.ros2.messages import ODOMETRY, TRANSFORMS
 from factorbus.ros2.problems import BadRecording
 from factorbus.ros2.recorded_drive import RecordedDrive, read_recording
 from factorbus.ros2.settings import Settings
@@ -160,6 +160,44 @@ def test_of_a_recording_that_was_cut_off_the_beginning_is_driven(whole: Path, tm
         assert any("no index" in note or "cut off" in note for note in made.notes)
     assert read > 30
     assert refused >= 4
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_of_a_chunk_that_is_cut_off_what_is_there_is_driven(
+    drive: recordings.Drive, whole: Path, tmp_path: Path, compression: CompressionType
+) -> None:
+    """One chunk has all, so without its beginning nothing is read."""
+    path, reference = tmp_path / "one.mcap", read_recording(whole, FOUND)
+    (tf, *_) = [each for each in drive.said if each.type_name == TRANSFORMS]
+    many = [tf._replace(topic="/other")] * 3000  # more blocks of the compression
+    data = recordings.write_mcap(path, [*drive.said, *many], compression, 1 << 30).read_bytes()
+    lengths = set[int]()
+    for share in (0.02, 0.5, 0.6, 0.7, 0.8, 0.9):
+        path.write_bytes(data[: int(share * len(data))])
+        try:
+            made = read_recording(path, FOUND)
+        except BadRecording:
+            continue
+        assert [bits(a) for a in made.steps] == [bits(b) for b in reference.steps[: len(made.steps)]]
+        assert any("no index" in note or "cut off" in note for note in made.notes)
+        lengths.add(len(made.steps))
+    assert lengths
+    assert min(lengths) > 0
+    path.write_bytes(data[:100])
+    with pytest.raises(BadRecording, match="before its first chunk does, so no message in it is whole"):
+        read_recording(path, FOUND)
+
+
+def test_of_a_topic_with_two_types_the_messages_of_one_are_read(drive: recordings.Drive, tmp_path: Path) -> None:
+    said = [each for each in drive.said if each.topic == "/odom"]
+    (tf, *_) = [each for each in drive.said if each.type_name == TRANSFORMS]
+    path = recordings.write_mcap(tmp_path / "two.mcap", [*said, tf._replace(topic="/odom")])
+    path.write_bytes(path.read_bytes()[:-40])  # as a whole it would not be read by its topic
+    made = read_recording(path, FOUND)
+    assert made.steps.poses == 45
+    assert any(
+        f"1 message not used; the first: a {tf.type_name}; wanted a {ODOMETRY}" in note for note in made.notes
+    ), made.notes
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

@@ -1,14 +1,19 @@
 """An MCAP file without its end, as a recorder that was killed leaves it: record by record, by the mcap library.
 
-rosbags wants the index at the end of the file.
+rosbags wants the index at the end of the file.  Of a chunk that is cut off the records up to there are read: it is
+compressed as a stream, of which every block that is whole can be unpacked.
 """
 
 import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Message, Schema
@@ -18,6 +23,7 @@ from factorbus.ros2.recording import Recorded, RecordedTopic, store_of
 
 _DEFINED, _ENCODED = "ros2msg", "cdr"
 _HEAD, _MAGIC = struct.Struct("<BQ"), b"\x89MCAP0\r\n"
+_BEFORE_COMPRESSION, _AFTER_IT = 28, 8  # bytes of a chunk: two times, a size and a checksum; the size of what follows
 
 
 class NothingWhole(Exception):
@@ -72,17 +78,63 @@ class UnfinishedMcap:
             return stream.read(len(_MAGIC)) == _MAGIC
 
     def _where_it_ends(self) -> str:
-        """By the opcode and the length that each record begins with."""
+        cut = self._cut_record()
+        if cut is None or not cut.is_chunk:
+            return "before its first chunk"
+        return f"{cut.lacking} bytes before its first chunk does"
+
+    def _records(self) -> Iterator[Any]:
+        """Raises what the library does where they end."""
+        cut = self._cut_record()
+        with self._path.open("rb") as stream:
+            try:
+                for record in StreamReader(stream).records:
+                    if cut is not None and stream.tell() > cut.at:
+                        break  # the library makes one of whatever there is
+                    yield record
+            except Exception:
+                if cut is None or stream.tell() <= cut.at:
+                    raise
+            if cut is not None and cut.is_chunk:
+                stream.seek(cut.at + _HEAD.size)
+                yield from StreamReader(BytesIO(_whole_records(stream.read())), skip_magic=True).records
+            raise EndOfFile()
+
+    def _cut_record(self) -> "_CutRecord | None":
+        """The last one where it is not whole, by the opcode and the length that each begins with."""
         with self._path.open("rb") as stream:
             at, size = len(_MAGIC), self._path.stat().st_size
             while at + _HEAD.size <= size:
                 stream.seek(at)
                 opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
-                at += _HEAD.size + length
-                if opcode == Opcode.CHUNK and at > size:
-                    return f"{at - size} bytes before its first chunk does"
-        return "before its first chunk"
+                begin, at = at, at + _HEAD.size + length
+                if at > size:
+                    return _CutRecord(begin, opcode == Opcode.CHUNK, at - size)
+        return None
 
-    def _records(self) -> Iterator[Any]:
-        with self._path.open("rb") as stream:
-            yield from StreamReader(stream).records
+
+class _CutRecord(NamedTuple):
+    """Where it begins, and how many bytes of it are lacking."""
+
+    at: int
+    is_chunk: bool
+    lacking: int
+
+
+def _whole_records(cut: bytes) -> bytes:
+    """Those of a chunk as far as its bytes go."""
+    stream = ReadDataStream(BytesIO(cut))
+    stream.read(_BEFORE_COMPRESSION)
+    compression = stream.read_prefixed_string()
+    data = cut[stream.count + _AFTER_IT :]
+    if compression == "zstd":
+        data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+    elif compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data)
+    at = end = 0
+    while end <= len(data):
+        at = end
+        if at + _HEAD.size > len(data):
+            break
+        end = at + _HEAD.size + _HEAD.unpack_from(data, at)[1]
+    return data[:at]
