@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import click
 
+from factorbus.cli.output.console import document
 from factorbus.cli.output.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, Stopped, report
 from factorbus.proto.nearest import nearest
 from factorbus.proto.version import __version__
@@ -101,11 +102,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code, and never shows a traceback unless asked to."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _print_what_can_be()
+    as_json = "--json" in arguments[: arguments.index("--")] if "--" in arguments else "--json" in arguments
     debug = "--debug" in arguments or bool(os.environ.get("FACTORBUS_DEBUG"))
     try:
         return cli.main(arguments, prog_name="factorbus", standalone_mode=False) or OK
     except click.ClickException as error:
         error.show()
+        if as_json:
+            document({"problem": {"code": "bad_usage", "message": error.format_message(), "detail": {}}})
         if isinstance(error, click.NoSuchOption) and re.fullmatch(r"-[0-9.]", error.option_name):
             click.echo("A number below 0 is written behind `--`, and options before that: NAME -- -1", err=True)
         return USAGE
@@ -117,11 +121,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return OK
     except OSError as error:
         if error.errno not in _FULL or error.filename is not None:
-            return report(error, as_json="--json" in arguments, debug=debug)
+            return report(error, as_json=as_json, debug=debug)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return report(Stopped("cannot_write", f"standard output cannot be written: {error.strerror}"), False, debug)
     except Exception as error:
-        return report(error, as_json="--json" in arguments, debug=debug)
+        return report(error, as_json=as_json, debug=debug)
 
 
 def _print_what_can_be() -> None:

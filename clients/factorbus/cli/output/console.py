@@ -19,7 +19,7 @@ def print_note(text: str) -> None:
 
 def document(content: Mapping[str, Any]) -> None:
     """The one JSON document of `--json`.  What is not finite becomes null: JSON has no word for it."""
-    click.echo(json.dumps(_strict(content), indent=2))
+    click.echo(json.dumps(_strict(content), indent=2, default=str))
 
 
 def table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
@@ -76,6 +76,6 @@ def _strict(value: Any) -> Any:
         return [_strict(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if hasattr(value, "item"):  # a numpy number
-        return _strict(value.item())
+    if hasattr(value, "tolist"):  # a numpy number or array
+        return _strict(value.tolist())
     return value

@@ -1,6 +1,5 @@
 """How a command ends: the exit codes, the errors of the command line itself, and which error leads to which code."""
 
-import json
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +9,7 @@ from typing import Any
 
 import click
 
+from factorbus.cli.output.console import document
 from factorbus.cli.output.installing import install_command
 from factorbus.proto.problems import Refused
 
@@ -63,8 +63,7 @@ def report(error: Exception, as_json: bool, debug: bool) -> int:
         click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
     click.echo(f"factorbus: {message} [{code}]", err=True)
     if as_json:
-        detail = getattr(error, "detail", {})
-        click.echo(json.dumps({"problem": {"code": code, "message": message, "detail": detail}}, default=str))
+        document({"problem": {"code": code, "message": message, "detail": getattr(error, "detail", {})}})
     return _exit_code(error, code)
 
 

@@ -15,7 +15,6 @@ log = logging.getLogger(__name__)
 _PATIENCE_S = 1.0  # for what is said once, where the socket is full
 
 
-
 class Notifier:
     """Tells the service manager, if there is one."""
 

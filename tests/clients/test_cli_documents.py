@@ -1,0 +1,54 @@
+"""Every command with --json prints one document and nothing else on standard output, also where it was typed wrong."""
+
+import json
+import math
+from collections.abc import Iterator
+
+import click
+import numpy as np
+import pytest
+
+from factorbus.cli.main import cli, main
+from factorbus.cli.output.exits import FAILED, USAGE, Stopped, report
+
+
+def with_json(group: click.Group, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The words of all commands that have --json."""
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if isinstance(command, click.Group):
+            yield from with_json(command, (*words, name))
+        elif command is not None and any("--json" in each.opts for each in command.params):
+            yield *words, name
+
+
+COMMANDS = sorted(with_json(cli))
+
+
+def test_there_are_many() -> None:
+    assert {words[0] for words in COMMANDS} >= {"ask", "bench", "change", "convert", "demo", "maps", "solve", "stats"}
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+@pytest.mark.parametrize("first", [True, False])
+def test_wrong_use_is_a_document(words: tuple[str, ...], first: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*words, *(("--json", "--nope") if first else ("--nope", "--json"))]) == USAGE
+    said = capsys.readouterr()
+    problem = json.loads(said.out)["problem"]
+    assert problem["code"] == "bad_usage"
+    assert "--nope" in problem["message"]
+    assert "--nope" in said.err
+
+
+def test_without_json_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["solve", "--nope"], ["maps", "--nope", "--", "--json"]):
+        assert main(words) == USAGE
+        assert capsys.readouterr().out == ""
+
+
+def test_what_json_has_no_word_for_is_null(capsys: pytest.CaptureFixture[str]) -> None:
+    detail = {"seen": math.nan, "row": np.array([1.0, np.inf]), "of": ValueError("x")}
+    assert report(Stopped("made_up", "of the test", **detail), as_json=True, debug=False) == FAILED
+    said = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    assert said["problem"]["detail"] == {"seen": None, "row": [1.0, None], "of": "x"}
