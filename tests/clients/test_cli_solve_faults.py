@@ -168,3 +168,12 @@ def test_a_tukey_loss_far_above_all_residuals_is_none(folder: Path) -> None:
     wide = solving.run_solve(solving.SolveRequest(Path("square.g2o"), loss=("tukey", 1e7)))
     assert wide["converged"]
     assert wide["chi2"] == pytest.approx(plain["chi2"], rel=1e-9)
+
+
+def test_gnc_says_that_it_trusts_priors(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    priors = "".join(f"EDGE_PRIOR_SE2 {k} {x} {y} 0 100 0 0 100 0 100\n" for k, x, y in ((0, 0, 0), (2, 9, 9)))
+    (folder / "priors.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n" + priors)
+    assert main(["solve", "priors.g2o", "--gnc", "--json"]) == OK
+    told, said = capsys.readouterr()
+    assert json.loads(told)["gnc"] == {"suspects": 0, "false": [], "trusted": 2}
+    assert "2 factors of one variable (priors, positions) trusted" in said

@@ -62,7 +62,11 @@ def _covariance(ctx: click.Context, parameter: click.Parameter, text: str | None
     help="Where to begin: composed odometry, the file's values, averaged rotations, or whichever of them ends lowest.",
 )
 @click.option("--loss", type=_Loss(), metavar="NAME:SCALE", help="Robust loss of all factors that close loops.")
-@click.option("--gnc", is_flag=True, help="Find the false ones among these by graduated non-convexity; leave them out.")
+@click.option(
+    "--gnc",
+    is_flag=True,
+    help="Find the false ones among these by graduated non-convexity; leave them out. Priors are trusted.",
+)
 @click.option(
     "--probability",
     type=Number(0, 1, min_open=True, max_open=True),
@@ -96,6 +100,8 @@ def command(request: SolveRequest, as_json: bool) -> int:
     In the result:
       starts       χ² of each start;  start: the one whose end is lowest
       chi2         Σ rᵀ Ω r at the end, of a factor with a loss ρ(rᵀ Ω r)
+      gnc          suspects: factors that were looked at;  false: those left out;  trusted: those of one variable, as
+                   priors and positions, which are not looked at: a false one pulls the map, or makes others false
       left         what one more Gauss-Newton step would take off it, predicted
       seconds      search: from the graph in memory to the optimum in memory, loading the solver's kernels included
     The exit code is 1 where the search has ended before it had converged.

@@ -70,7 +70,7 @@ def run_solve(request: SolveRequest) -> dict[str, Any]:
             graph, false = _timed(
                 seconds, "gnc", lambda: without_false(graph, request.probability, search.memory_limit_bytes, events)
             )
-            result["gnc"] = _told(false.suspects, false.rows)
+            result["gnc"] = _told(false.suspects, false.rows, _of_one_variable(graph))
         found, solved = _timed(seconds, "search", lambda: optimum_of(graph, search, events))
     result |= {
         "starts": {_WORDS.get(name, name): chi2 for name, chi2 in found.starts.items()},
@@ -180,10 +180,16 @@ def _sizes(graph: Batch) -> dict[str, int]:
     }
 
 
-def _told(suspects: int, rows: tuple[tuple[str, tuple[int, ...], float], ...]) -> dict[str, Any]:
+def _of_one_variable(graph: Batch) -> int:
+    return sum(len(group.keys) for group in graph.factors if group.keys.shape[1] == 1)
+
+
+def _told(suspects: int, rows: tuple[tuple[str, tuple[int, ...], float], ...], trusted: int) -> dict[str, Any]:
+    if trusted:
+        print_note(f"{counted(trusted, 'factor')} of one variable (priors, positions) trusted: see solve --help")
     print_note(f"graduated non-convexity: {len(rows)} of {counted(suspects, 'factor')} that close loops are false")
     false = [{"kind": kind, "keys": [format_symbol(key) for key in keys], "distance": s} for kind, keys, s in rows]
-    return {"suspects": suspects, "false": false}
+    return {"suspects": suspects, "false": false, "trusted": trusted}
 
 
 def _covariances(graph: Batch, wanted: Path | tuple[int, ...] | None) -> list[tuple[str, str, Any]]:
