@@ -13,7 +13,14 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 from factorbus.proto.problems import Busy, Problem
 from factorbus.proto.records import JournalPlace, RecordsAnswer, SentInsert, SentRecord
 from factorbus.service.journal.record_problems import OtherRecords, RecordsMovedOn
-from factorbus.service.replica.core import AskUpstream, JoinUpstream, PutIn, SendUpstream, UpstreamCore
+from factorbus.service.replica.core import (
+    COLLECTED_BYTES,
+    AskUpstream,
+    JoinUpstream,
+    PutIn,
+    SendUpstream,
+    UpstreamCore,
+)
 
 MOST = 5  # records that one message of the models takes
 
@@ -249,6 +256,62 @@ def test_nothing_is_sent_before_it_is_known_where_both_are_the_same() -> None:
     (sent,) = core.tick(10.2)
     assert isinstance(sent, SendUpstream)
     assert core.connected
+
+
+def three(begin: int) -> tuple[SentRecord, ...]:
+    return tuple(record_of("other", begin + n) for n in range(3))
+
+
+def joined(head: int) -> tuple[UpstreamCore, AskUpstream]:
+    core = UpstreamCore(JournalPlace(), head, 0.0)
+    (join,) = core.link(True, 0.0)
+    (asked,) = core.joined(join.number, 0.0)
+    assert isinstance(asked, AskUpstream)
+    return core, asked
+
+
+def test_what_is_here_alone_is_made_again_once_however_much_comes() -> None:
+    core, asked = joined(head=4)
+    places = [JournalPlace(3 * n, bytes([n]) * 16) for n in range(1, 4)]
+    (asked,) = core.answered(asked.number, RecordsAnswer(1, places[0], three(1), more=True), 0.0)
+    assert isinstance(asked, AskUpstream)
+    assert asked.after == places[0], "it goes on from where it is, and has put in nothing"
+    core.silent(asked.number, False, 0.1)
+    (asked,) = core.tick(2.0)
+    assert isinstance(asked, AskUpstream)
+    assert asked.after == places[0], "and begins nothing anew after silence"
+    (asked,) = core.answered(asked.number, RecordsAnswer(1, places[1], three(4), more=True), 2.0)
+    (put,) = core.answered(asked.number, RecordsAnswer(1, places[2], three(7)), 2.0)
+    assert isinstance(put, PutIn)
+    assert (put.after, put.place) == (JournalPlace(), places[2])
+    assert put.records == (*three(1), *three(4), *three(7))
+    core.put(put.number, places[2], 13, 2.0)
+    assert core.place == places[2]
+
+
+def test_where_nothing_is_here_alone_what_comes_is_put_in_as_it_comes() -> None:
+    core, asked = joined(head=0)
+    (put,) = core.answered(asked.number, RecordsAnswer(1, JournalPlace(3, b"a" * 16), three(1), more=True), 0.0)
+    assert isinstance(put, PutIn)
+    assert put.records == three(1)
+
+
+def test_what_was_collected_from_an_upstream_that_is_another_one_since_is_not_used() -> None:
+    core, asked = joined(head=4)
+    (asked,) = core.answered(asked.number, RecordsAnswer(1, JournalPlace(3, b"a" * 16), three(1), more=True), 0.0)
+    (asked,) = core.refused(asked.number, OtherRecords("m", 0, 3), 0.0)
+    assert isinstance(asked, AskUpstream)
+    assert asked.after == JournalPlace()
+    (put,) = core.answered(asked.number, RecordsAnswer(1, JournalPlace(3, b"b" * 16), three(9)), 0.0)
+    assert isinstance(put, PutIn)
+    assert put.records == three(9)
+
+
+def test_what_is_collected_has_a_bound() -> None:
+    core, asked = joined(head=4)
+    large = SentRecord(0, (SentInsert("other", 1, bytes(COLLECTED_BYTES), 1),))
+    (put,) = core.answered(asked.number, RecordsAnswer(1, JournalPlace(1, b"a" * 16), (large,), more=True), 0.0)
+    assert isinstance(put, PutIn)
 
 
 def test_a_slow_link_gets_smaller_messages_and_silence_longer_pauses() -> None:

@@ -8,7 +8,7 @@ Every reader raises BadMessage, TooLarge.
 """
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -233,7 +233,7 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def with_messages(records: Sequence[SentRecord], had: dict[int, bytes]) -> tuple[SentRecord, ...]:
+def with_messages(records: Sequence[SentRecord], had: Mapping[int, bytes]) -> tuple[SentRecord, ...]:
     """`records` with the messages that were named; `had`: by digest.  Raises BadMessage for one that was not."""
 
     def whole(insert: SentInsert) -> SentInsert:

@@ -105,7 +105,7 @@ class InterestCore:
         if not self.listening:
             return None
         if not self._tables.live:
-            return max(now, self._fetched_at + _FETCH_AGAIN_S)
+            return max(now, self._fetched_at + (_FETCH_AGAIN_S if self._streams else _FETCH_S))
         times = [stream.ends_at for stream in self._streams.values()]
         times += [due for stream in self._streams.values() if (due := stream.due(self._tables)) is not None]
         return min(times, default=None)

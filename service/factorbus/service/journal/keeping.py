@@ -262,13 +262,14 @@ class Keeper:
         gone = rewrite(self._store, last, records, place, present_build())
         for record in gone:
             file_of(self.folder, record).unlink(missing_ok=True)
-        if last.record < self.last.record:
+        grew = last.record == self.last.record
+        if not grew:
             self._life += 1
             self._checkpoint.record = min(self._checkpoint.record, last.record)
         if records:
             last = Last(records[-1].number, records[-1].revision, records[-1].chain)
         self.last, self.upstream = last, place or self.upstream
-        self.written(None)
+        self.written(records if grew else None)
 
     def _append(self, records: list[JournalRecord]) -> None:
         started = time.perf_counter()

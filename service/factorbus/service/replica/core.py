@@ -1,13 +1,14 @@
 """How a map follows its upstream: what is asked, sent and put in next.  Pure: events in, effects out; one at a time.
 
-    joins ──▶ asks what came after the last place known to be the same ──▶ puts it in ──▶ ...
+    joins ──▶ asks what came after the last place known to be the same, all of it ──▶ puts it in ──▶ ...
                  ▲                                                            │ nothing came
                  │ upstream moved on, or nobody knows whether it was taken    ▼
                  └───────────────────────────────────────── sends what is here alone ──▶ ...
 
-A place is known to be the same only when upstream has said so.  After silence it is asked for, so what was sent and not
-answered is neither lost nor there twice.  Events carry the number of what they answer; that of an earlier one is
-dropped.
+What is here alone is made again behind what comes, so that is collected first, as far as memory allows, and put in at
+once.  A place is known to be the same only when upstream has said so.  After silence it is asked for, so what was sent
+and not answered is neither lost nor there twice.  Events carry the number of what they answer; that of an earlier one
+is dropped.
 """
 
 import math
@@ -21,6 +22,8 @@ POLL_S = 1.0  # with nothing to send, upstream is asked so often
 PAUSES_S = (0.1, 1.0)  # after silence, doubling
 REFUSED_S = 5.0  # after a refusal that time alone will not mend
 LEAST_BYTES = 4 << 10
+COLLECTED_BYTES = 64 << 20  # of what came from upstream and is not yet put in; the next answer goes beyond it
+_RECORD_BYTES = 200  # of a record without its messages
 _RETRIED = ("busy", "shutting_down", "journal_failed", "out_of_memory", "unavailable")
 
 
@@ -75,6 +78,8 @@ class UpstreamCore:
         self._unsure = head  # records up to here may be upstream, though it has not said so
         self._number, self._doing = 0, ""
         self._more = False
+        self._coming: list[SentRecord] = []  # from upstream, up to `_come`
+        self._come, self._coming_bytes = place, 0
         self._not_before, self._pause_s, self._heard = -math.inf, PAUSES_S[0], -math.inf
         self._most_bytes = MOST_BYTES
 
@@ -129,10 +134,15 @@ class UpstreamCore:
         self._heard_from(now)
         self._most_bytes = min(2 * self._most_bytes, MOST_BYTES)
         if doing == "ask":
-            self._more = answer.more
+            self._more = answer.more and bool(answer.records)
             if answer.records:
-                self._begin("put")
-                return [PutIn(self._number, self.place, answer.records, answer.place)]
+                self._coming += answer.records
+                self._come = answer.place
+                self._coming_bytes += sum(map(_bytes_of, answer.records))
+            if self._more and self.head > self.place.record and self._coming_bytes < COLLECTED_BYTES:
+                return self._go_on(now)
+            if self._coming:
+                return self._put_in()
             self._must_ask, self._unsure = False, self.place.record
         elif answer.same:
             self.place, self._must_ask = answer.place, False
@@ -146,6 +156,7 @@ class UpstreamCore:
             return []
         self._doing = ""
         self.place, self.head, self._must_ask = place, head, self._more
+        self._forget_what_comes()
         self._unsure = max(self._unsure, head) if self._more else place.record
         return self._go_on(now)
 
@@ -156,10 +167,16 @@ class UpstreamCore:
         doing, self._doing, self._must_ask = self._doing, "", True
         if doing != "put":
             self._heard_from(now)
+        collected = bool(self._coming)
+        if doing == "put" or problem.code == "other_records":
+            self._forget_what_comes()
         if problem.code == "records_moved_on" and doing == "send":
+            return self._go_on(now)
+        if problem.code == "other_records" and doing == "ask" and collected:  # upstream is another one since
             return self._go_on(now)
         if problem.code == "other_records" and self.place.record:
             self.place, self._unsure = JournalPlace(), self.head
+            self._forget_what_comes()
             return self._go_on(now)
         if problem.code == "unknown_map":
             self._joined = False
@@ -187,11 +204,19 @@ class UpstreamCore:
             return [JoinUpstream(self._number)]
         if self._must_ask or (self.head <= self.place.record and now - self._heard >= POLL_S):
             self._begin("ask")
-            return [AskUpstream(self._number, self.place, self._unsure, self._most_bytes)]
+            after = self._come if self._coming else self.place
+            return [AskUpstream(self._number, after, self._unsure, self._most_bytes)]
         if self.head > self.place.record and now - self._heard >= SEND_S:
             self._begin("send")
             return [SendUpstream(self._number, self.place, self._most_bytes)]
         return []
+
+    def _put_in(self) -> list[UpstreamEffect]:
+        self._begin("put")
+        return [PutIn(self._number, self.place, tuple(self._coming), self._come)]
+
+    def _forget_what_comes(self) -> None:
+        self._coming, self._come, self._coming_bytes = [], self.place, 0
 
     def _begin(self, doing: str) -> None:
         self._number += 1
@@ -214,3 +239,7 @@ class UpstreamCore:
     def _wait(self, now: float) -> None:
         self._not_before = now + self._pause_s
         self._pause_s = min(2 * self._pause_s, PAUSES_S[1])
+
+
+def _bytes_of(record: SentRecord) -> int:
+    return _RECORD_BYTES + sum(len(insert.message) for insert in record.inserts)

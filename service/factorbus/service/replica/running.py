@@ -6,17 +6,19 @@ open a session now and then; clients here never wait for it.
 
 import logging
 import queue
+import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
+from typing import Any, NamedTuple, Protocol
 
 from factorbus.journal.problems import JournalDamaged, JournalUnreadable
 from factorbus.journal.records import JournalRecord
 from factorbus.journal.rewriting import UpstreamPlace, upstream_of
 from factorbus.journal.store import open_store
 from factorbus.proto import codec, keys
-from factorbus.proto.problems import Problem
+from factorbus.proto.problems import Internal, Problem
 from factorbus.proto.records import (
     MOST_NAMED,
     MOST_RECORDS,
@@ -84,6 +86,14 @@ class _LocalAsker:
         self._done(codec.decode_problem(message))
 
 
+class _Sent(NamedTuple):
+    """What went with a query: inserts, up to a chain; had: messages of inserts that were named, by digest."""
+
+    inserts: int = 0
+    chain: bytes = b""
+    had: Mapping[int, bytes] = {}
+
+
 class _Followed:
     """One map of this service."""
 
@@ -115,6 +125,8 @@ class Replicas:
         self._alive, self._open_at = False, 0.0
         self._events: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._ticking = False
+        self._no_session = ""  # why there is none
+        self._unfollowed: dict[str, str] = {}  # maps that cannot be followed, and why
         self._thread = threading.Thread(target=self._run, name="upstream", daemon=True)
         self._thread.start()
 
@@ -150,7 +162,7 @@ class Replicas:
             "sent_bytes": followed.sent_bytes,
             "received_bytes": followed.received_bytes,
             "code": problem.code if problem is not None else "",
-            "problem": str(problem.message) if problem is not None else "",
+            "problem": str(problem.message) if problem is not None else self._no_session,
         }
 
     # ---- on the thread ----------------------------------------------------------------------------------------------
@@ -179,9 +191,11 @@ class Replicas:
         if self._session is None and now >= self._open_at:
             try:
                 self._session = self._open_session(lambda alive: self._events.put(lambda: self._seen(alive)))
+                self._no_session = ""
             except Problem as problem:
-                log.debug("upstream %s: %s", self._endpoint, problem)
-                self._open_at = time.monotonic() + _OPENING_S
+                if self._no_session != problem.message:
+                    log.warning("upstream %s: %s; going on alone, and trying again", self._endpoint, problem)
+                self._no_session, self._open_at = problem.message, time.monotonic() + _OPENING_S
         hosts = self._hosts()
         for name in [name for name, followed in self._maps.items() if hosts.get(name) is not followed.host]:
             del self._maps[name]
@@ -202,7 +216,7 @@ class Replicas:
         try:
             store = open_store(keeper.folder, read_only=True)
         except Problem as problem:
-            log.error("map %s follows nobody: %s", name, problem)
+            self._cannot_follow(name, problem)
             return
         try:
             place, last = upstream_of(store), keeper.last
@@ -210,7 +224,7 @@ class Replicas:
                 place = UpstreamPlace(*JournalPlace())
             behind = sum(len(record.entries) for record in store.records(place.record))
         except (JournalDamaged, JournalUnreadable) as problem:
-            log.error("map %s follows nobody: %s", name, problem)
+            self._cannot_follow(name, problem)
             return
         finally:
             store.close()
@@ -219,8 +233,15 @@ class Replicas:
         followed = _Followed(host, keeper, UpstreamCore(JournalPlace(*place), last.record, time.monotonic()))
         followed.behind = behind
         self._maps[name] = followed
+        self._unfollowed.pop(name, None)
         if self._alive:
             self._do(followed, followed.core.link(True, time.monotonic()))
+
+    def _cannot_follow(self, name: str, problem: Problem) -> None:
+        """It is tried again with every tick, and said once."""
+        if self._unfollowed.get(name) != problem.message:
+            log.error("map %s follows nobody: %s", name, problem)
+        self._unfollowed[name] = problem.message
 
     def _seen(self, alive: bool) -> None:
         if alive != self._alive:
@@ -245,15 +266,25 @@ class Replicas:
 
     def _do(self, followed: _Followed, effects: Sequence[UpstreamEffect]) -> None:
         for effect in effects:
-            match effect:
-                case JoinUpstream():
-                    self._join(followed, effect)
-                case AskUpstream():
-                    self._ask(followed, effect)
-                case SendUpstream():
-                    self._send(followed, effect)
-                case PutIn():
-                    self._put(followed, effect)
+            try:
+                self._perform(followed, effect)
+            except Exception as fault:  # a journal that cannot be read, say: it is tried again after a while
+                if not isinstance(fault, Problem):
+                    reference = secrets.token_hex(4)
+                    log.exception("fault %s: map %s and its upstream", reference, followed.host.core.name)
+                    fault = Internal(reference)
+                self._told(followed, effect.number, fault, None)
+
+    def _perform(self, followed: _Followed, effect: UpstreamEffect) -> None:
+        match effect:
+            case JoinUpstream():
+                self._join(followed, effect)
+            case AskUpstream():
+                self._ask(followed, effect)
+            case SendUpstream():
+                self._send(followed, effect)
+            case PutIn():
+                self._put(followed, effect)
 
     def _join(self, followed: _Followed, effect: JoinUpstream) -> None:
         core = followed.host.core
@@ -261,27 +292,28 @@ class Replicas:
         self._query(followed, effect.number, keys.admin_key("create"), payload)
 
     def _ask(self, followed: _Followed, effect: AskUpstream) -> None:
-        named: list[int] = []
+        had: dict[int, bytes] = {}
         if effect.unsure > effect.after.record:
             own = [record for record in followed.tail.after(effect.after.record) if record.number <= effect.unsure]
-            named = [message_digest(entry.message) for record in own for entry in record.entries][:MOST_NAMED]
-        payload = encode_records_ask(RecordsAsk(effect.after, tuple(named), effect.most_bytes))
-        self._query(followed, effect.number, keys.ask_key(followed.host.core.name, "records"), payload)
+            entries = islice((entry for record in own for entry in record.entries), MOST_NAMED)
+            had = {message_digest(entry.message): entry.message for entry in entries}
+        payload = encode_records_ask(RecordsAsk(effect.after, tuple(had), effect.most_bytes))
+        key = keys.ask_key(followed.host.core.name, "records")
+        self._query(followed, effect.number, key, payload, _Sent(had=had))
 
     def _send(self, followed: _Followed, effect: SendUpstream) -> None:
         own = followed.tail.after(effect.after.record)
         records, last, _ = sent_records(own, _NOTHING, effect.most_bytes, MOST_RECORDS)
         if last is None:
-            return
+            folder = followed.keeper.folder
+            raise JournalDamaged(folder, f"it ends before record {effect.after.record + 1}, which was written")
         followed.core.sent(effect.number, last.record)
         payload = encode_records_push(RecordsPush(effect.after, records))
         inserts = sum(len(record.inserts) for record in records)
         key = keys.records_key(followed.host.core.name, self._name)
-        self._query(followed, effect.number, key, payload, (inserts, last.chain))
+        self._query(followed, effect.number, key, payload, _Sent(inserts, last.chain))
 
-    def _query(
-        self, followed: _Followed, number: int, key: str, payload: bytes, sent: tuple[int, bytes] | None = None
-    ) -> None:
+    def _query(self, followed: _Followed, number: int, key: str, payload: bytes, sent: "_Sent | None" = None) -> None:
         followed.sent_bytes += len(payload)
         if self._session is None:
             return
@@ -291,8 +323,10 @@ class Replicas:
 
         self._session.ask(key, payload, _PATIENCE_S, done)
 
-    def _told(self, followed: _Followed, number: int, result: Any, sent: tuple[int, bytes] | None) -> None:
+    def _told(self, followed: _Followed, number: int, result: Any, sent: "_Sent | None") -> None:
         core, now = followed.core, time.monotonic()
+        if self._maps.get(followed.host.core.name) is not followed:
+            return  # the map was dropped meanwhile, and there may be another one of its name
         if isinstance(result, Problem):
             if result.code not in ("records_moved_on", "busy"):
                 log.warning("map %s: upstream %s: %s", followed.host.core.name, self._endpoint, result)
@@ -307,6 +341,7 @@ class Replicas:
             return
         try:
             answer = decode_records_answer(result, message_digest)
+            answer = answer._replace(records=with_messages(answer.records, sent.had if sent is not None else {}))
         except Problem as problem:
             self._do(followed, core.refused(number, problem, now))
             return
@@ -314,27 +349,18 @@ class Replicas:
         effects = core.answered(number, answer, now)
         if sent is not None and core.place != before:
             followed.keeper.upstream = UpstreamPlace(*core.place)
-            followed.behind -= sent[0]
-            self._compare(followed, sent[1] == core.place.chain)
+            followed.behind -= sent.inserts
+            self._compare(followed, sent.chain == core.place.chain)
         self._do(followed, effects)
 
     def _put(self, followed: _Followed, effect: PutIn) -> None:
-        lacking = any(not insert.message for record in effect.records for insert in record.inserts)
-        own = followed.tail.after(effect.after.record) if lacking else []
-        had = {message_digest(entry.message): entry.message for record in own for entry in record.entries}
-        try:
-            records = with_messages(effect.records, had)
-        except Problem as problem:
-            self._do(followed, followed.core.refused(effect.number, problem, time.monotonic()))
-            return
-
         def heard(grafted: Grafted) -> None:
             self._events.put(lambda: self._grafted(followed, effect, grafted))
 
         def refused(problem: Any) -> None:
             self._events.put(lambda: self._told(followed, effect.number, problem, None))
 
-        graft = Graft(effect.after, records, effect.place, heard)
+        graft = Graft(effect.after, effect.records, effect.place, heard)
         followed.host.graft(_LocalAsker(refused), graft)
 
     def _grafted(self, followed: _Followed, effect: PutIn, grafted: Grafted) -> None:
