@@ -132,9 +132,10 @@ class Service:
 
     def wait(self, seconds: float) -> None:
         """Time goes by, and what is due then is done when it is."""
-        end = self.now + seconds
+        end, ticks = self.now + seconds, 0
         while (due := self.core.next_due(self.now)) is not None and due <= end:
-            self.now = max(self.now, due)
+            self.now, ticks = max(self.now, due), ticks + 1
+            assert ticks < 10_000, "what is due again and again, and not done, keeps a core busy"
             self.perform(self.core.tick(self.now))
         self.now = end
 
