@@ -8,7 +8,7 @@ import pytest
 from interests import Follower, Service, World, groups, part
 
 from factorbus.proto.interest import Interest, filter_of
-from factorbus.proto.interest_codec import AskInterest, decode_interest_answer
+from factorbus.proto.interest_codec import AskInterest, decode_interest_answer, decode_interest_delta
 from factorbus.proto.messages import Delta
 from factorbus.proto.problems import TooLarge, UnknownMap
 from factorbus.proto.symbols import symbol
@@ -202,7 +202,7 @@ def test_where_more_has_gone_than_a_message_tells_all_is_told() -> None:
     service.settle()
     follower.deaf = 100
     service.step(world.without(list(drive(400))))
-    service.wait(30.0)
+    service.wait(10.0)
     follower.deaf = 0
     service.sent.clear()
     service.step(world.step(drive(1, 410, 9.0)))
@@ -260,6 +260,24 @@ def test_what_has_gone_and_came_back_is_not_told_to_be_gone() -> None:
     assert [symbol("x", 3) in group.keys for group in answer.variables] == [True]
     service.wait(1.0)
     assert early.values == part(early.interest, world.values)
+
+
+def test_what_came_back_and_was_brought_to_somebody_is_not_told_to_be_gone() -> None:
+    world = World()
+    service = Service(world)
+    service.step(world.step(drive(10)))
+    slow = Interest(period_ms=1000)
+    following(service, slow)
+    service.step(world.step({("se2", symbol("x", 9)): (9.0, 1.0, 0.0)}))
+    service.wait(0.01)
+    service.step(world.without([("se2", symbol("x", 3))]))
+    service.step(world.step({("se2", symbol("x", 3)): (3.0, 5.0, 0.0)}))
+    joined, messages = following(service, slow), []
+    joined.hear = lambda _channel, message: messages.append(decode_interest_delta(message))  # type: ignore[method-assign]
+    service.wait(1.1)
+    (message,) = messages
+    assert message.gone == ()
+    assert [symbol("x", 3) in group.keys for group in message.variables] == [True]
 
 
 def marked(values: dict[tuple[str, int], tuple[float, ...]]) -> tuple[InterestTables, InterestMarks]:

@@ -48,6 +48,23 @@ def test_a_candidate_that_is_there_many_times_counts_once() -> None:
     assert judged.best.members.tolist() == list(range(8))
 
 
+def test_one_guess_made_many_times_does_not_hide_those_that_agree() -> None:
+    """A place recognizer that takes one place for another says so whenever the robot is there."""
+    rng = np.random.default_rng(2)
+    one, other = drive("se2", 60, rng), drive("se2", 60, rng)
+    right = candidates_of("se2", one, other, (5, 0), 0, rng)
+    (wrong,) = candidates_of("se2", one, other, (0, 1), 0, rng)
+    again = [wrong._replace(z=wrong.z + rng.normal(0, 1e-3, 3)) for _ in range(30)]
+    maps = solved(one.steps), solved(other.steps)
+    judged = judge(as_matrices("se2", *maps, [*again, *right]))
+    assert judged.verdict == ALIGNED
+    assert judged.best is not None
+    assert judged.best.members.tolist() == [30, 31, 32, 33, 34]
+    gap = log_of(np.linalg.inv(judged.best.T) @ true_frame(one, other))
+    assert np.abs(gap).max() < 2.0
+    assert judge(as_matrices("se2", *maps, again + right[:2])).verdict == TOO_FEW
+
+
 def test_one_or_no_candidate_says_nothing() -> None:
     rng = np.random.default_rng(3)
     one, other = drive("se2", 30, rng), drive("se2", 30, rng)

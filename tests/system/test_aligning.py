@@ -63,6 +63,26 @@ def test_two_maps_become_one(endpoint: str) -> None:
         assert how_far_off(hall, one, other) < 3.0
 
 
+def test_copies_of_a_candidate_are_no_further_candidates(endpoint: str) -> None:
+    one, other, candidates = drives(3, 6, 4, 0)
+    with connect(endpoint, client="merger", timeout_s=60) as bus, bus.map("hall-c") as hall, bus.map("yard-c") as yard:
+        fill(hall, one)
+        fill(yard, other)
+        found = align(hall, yard, drafted(candidates), letters=LETTERS)
+        wrong = next(each for each in candidates if not each.is_right)
+        first = [wrong] * 50 + candidates + candidates
+        again = align(hall, yard, drafted(first), letters=LETTERS)
+        assert again.verdict == found.verdict == "aligned"
+        assert "; 60 copies of others left out" in str(again)
+        picked = [first[k] for k in again.agree]
+        assert sorted((each.a, each.b) for each in picked) == sorted(
+            (candidates[k].a, candidates[k].b) for k in found.agree
+        )
+        assert again.anchors().factor_count == len(found.agree)
+        assert again.covariance is not None
+        np.testing.assert_allclose(again.covariance, found.covariance, rtol=1e-6)
+
+
 def test_what_is_ambiguous_or_too_little_is_not_merged(endpoint: str) -> None:
     one, other, candidates = drives(4, 10, 0, 9)
     with connect(endpoint, client="merger", timeout_s=60) as bus, bus.map("hall-b") as hall, bus.map("yard-b") as yard:

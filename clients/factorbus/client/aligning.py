@@ -118,16 +118,17 @@ def align(
     ends = [_ends(pair, known_here, known_there) for group in given.factors for pair in group.keys.tolist()]
     of_a, of_b = [known_here[a] for a, *_ in ends], [known_there[b] for _, b, _ in ends]
     z, noise = _measured(given, kind, np.array([turned for *_, turned in ends]))
+    kept = _first_of_each(ends, z, noise)
     known = CandidatePoses(
-        np.array([matrix for _, matrix in of_a]),
-        np.array([matrix for _, matrix in of_b]),
-        z,
-        noise,
-        _joint(here, [key for key, _ in of_a], timeout_s),
-        _joint(other, [key for key, _ in of_b], timeout_s),
-        np.array([(a, b) for a, b, _ in ends]),
+        np.array([of_a[k][1] for k in kept]),
+        np.array([of_b[k][1] for k in kept]),
+        z[kept],
+        noise[kept],
+        _joint(here, [of_a[k][0] for k in kept], timeout_s),
+        _joint(other, [of_b[k][0] for k in kept], timeout_s),
+        np.array([ends[k][:2] for k in kept]),
     )
-    return _alignment(judge(known), given)
+    return _alignment(judge(known), given, np.array(kept))
 
 
 def _kind_of(given: Batch) -> str:
@@ -195,6 +196,14 @@ def _measured(given: Batch, kind: str, turned: np.ndarray) -> tuple[F64, F64]:
     return z, covariance
 
 
+def _first_of_each(ends: list[tuple[int, int, bool]], z: F64, noise: F64) -> list[int]:
+    """Which candidates are not a copy of one before: the same measurement twice is no more certain than once."""
+    first: dict[tuple[int, int, bytes, bytes], int] = {}
+    for k, (a, b, _) in enumerate(ends):
+        first.setdefault((a, b, z[k].tobytes(), noise[k].tobytes()), k)
+    return list(first.values())
+
+
 def _check_certain(given: Batch, z: F64, omega: F64) -> None:
     """Raises CannotMerge: a candidate is no number, or says nothing of a direction."""
     finite = np.isfinite(z).all(axis=(1, 2)) & np.isfinite(omega).all(axis=(1, 2))
@@ -217,19 +226,22 @@ def _joint(of: Map, keys: list[int], timeout_s: float | None) -> F64:
     return whole[np.ix_(rows, rows)]
 
 
-def _alignment(found: Judgement, given: Batch) -> Alignment:
+def _alignment(found: Judgement, given: Batch, kept: I64) -> Alignment:
     best, rival = found.best, found.rival
     nobody = np.empty(0, np.int64)
+    said, copies = _sentence(found, kept.size), given.factor_count - kept.size
+    if copies:
+        said += f"; {counted(copies, 'copy', 'copies')} of others left out"
     return Alignment(
         found.verdict,
         None if best is None else pose_of_matrix(best.T),
-        None if best is None else best.reference,
+        None if best is None else int(kept[best.reference]),
         None if best is None else best.covariance,
-        nobody if best is None else best.members,
-        nobody if rival is None else rival.members,
+        nobody if best is None else kept[best.members],
+        nobody if rival is None else kept[rival.members],
         math.inf if best is None else best.by_chance,
         given,
-        _sentence(found, given.factor_count),
+        said,
     )
 
 

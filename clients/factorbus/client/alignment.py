@@ -11,7 +11,8 @@ the covariance of all residuals r_i = Log(z_i⁻¹ A_i⁻¹ T B_i) together.  A 
 raises its χ² by no more than the quantile; one of the set leaves where χ² falls by more.
 
 The set is believed if such a set would come about by chance less than `MOST_BY_CHANCE` times, were the false ones
-anywhere, and if among all others there is no set that is not by chance either and has half as many.
+anywhere, and if among all others there is no set that is not by chance either and has half as many.  One that is not is
+set aside, and the largest of the others is looked at.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ THREE_SIGMAS = {3: 14.156, 6: 20.062}
 FEWEST = 3  # places that agree: two may be one mistake made twice
 MOST_BY_CHANCE = 1e-3  # sets, expected
 RIVAL_SHARE = 0.5  # of the members of the largest set
-_MOST_ROUNDS, _MOST_JOINING = 20, 5
+_MOST_ROUNDS, _MOST_JOINING, _MOST_ASIDE = 20, 5, 5
 ALIGNED, AMBIGUOUS, TOO_FEW = "aligned", "ambiguous", "too_few"
 
 
@@ -90,12 +91,18 @@ class Judgement(NamedTuple):
 def judge(candidates: CandidatePoses) -> Judgement:
     """Find the largest set that agrees, and whether it is to be believed."""
     everyone = np.arange(len(candidates.z))
-    best = _largest_set(candidates, everyone)
-    if best is None:
-        return Judgement(TOO_FEW, None, None)
-    rival = _largest_set(candidates, np.setdiff1d(everyone, best.members))
-    if not _is_believed(candidates, best):
-        return Judgement(TOO_FEW, best, rival)
+    best = first = _largest_set(candidates, everyone, everyone.size)
+    others = everyone if first is None else np.setdiff1d(everyone, first.members)
+    # A large set may be one guess between two poses, made again and again: it says no more than once.
+    for _ in range(_MOST_ASIDE):
+        if best is None or _is_believed(candidates, best):
+            break
+        best = _largest_set(candidates, others, everyone.size)
+        others = others if best is None else np.setdiff1d(others, best.members)
+    if best is None or not _is_believed(candidates, best):
+        rest = everyone if first is None else np.setdiff1d(everyone, first.members)
+        return Judgement(TOO_FEW, first, _largest_set(candidates, rest, rest.size))
+    rival = _largest_set(candidates, others, others.size)
     if rival is not None and _is_believed(candidates, rival) and _differs(candidates, best, rival):
         places, of_rival = _count_places(candidates, best.members), _count_places(candidates, rival.members)
         if of_rival >= RIVAL_SHARE * places:
@@ -169,8 +176,8 @@ def _of_pairs(jacobian: F64, known: F64, i: I64, j: I64, d: int) -> F64:
     return jacobian @ both @ jacobian.swapaxes(1, 2)
 
 
-def _largest_set(c: CandidatePoses, among: I64) -> AgreeingSet | None:
-    """The largest set among some candidates; None where no two agree."""
+def _largest_set(c: CandidatePoses, among: I64, count: int) -> AgreeingSet | None:
+    """The largest set among some candidates, which were chosen of `count`; None where no two agree."""
     if among.size < 2:
         return None
     taken = _taken(c, among)
@@ -180,7 +187,7 @@ def _largest_set(c: CandidatePoses, among: I64) -> AgreeingSet | None:
     reference = _in_their_midst(taken, members)
     residuals = _Residuals(_seen_from(taken, reference))
     members, fit = _refined(residuals, members, residuals.fit(members))
-    by_chance = _expected_by_chance(among.size, _count_places(taken, members), _chance(taken, residuals))
+    by_chance = _expected_by_chance(count, _count_places(taken, members), _chance(taken, residuals))
     T = taken.a[reference] @ fit.T @ _inverse(taken.b[reference])
     return AgreeingSet(among[members], T, int(among[reference]), fit.covariance, by_chance)
 
