@@ -307,6 +307,42 @@ def test_what_was_collected_from_an_upstream_that_is_another_one_since_is_not_us
     assert put.records == three(9)
 
 
+def test_what_cannot_be_put_in_is_tried_again_later_and_later_and_is_not_asked_for_again() -> None:
+    """While the disk is full the link is not used for what is here already."""
+    core, asked = joined(head=0)
+    (put,) = core.answered(asked.number, RecordsAnswer(1, JournalPlace(3, b"a" * 16), three(1)), 0.0)
+    now, pauses = 0.0, []
+    for _ in range(12):
+        assert isinstance(put, PutIn)
+        assert put.records == three(1)
+        assert core.refused(put.number, Busy(1, 0.1), now) == []
+        assert core.problem is not None
+        due = core.due_s(now)
+        assert due is not None
+        assert core.tick(now + 0.9 * due) == []
+        core.link(False, now)
+        assert core.link(True, now) == [], "a link that comes back makes no room on the disk"
+        now += due
+        pauses.append(round(due, 3))
+        (put,) = core.tick(now)
+    assert pauses == [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 60.0, 60.0, 60.0]
+    core.put(put.number, JournalPlace(3, b"a" * 16), 3, now)
+    assert (core.problem, core.place.record) == (None, 3)
+
+
+def test_what_comes_to_another_end_here_is_asked_for_again_from_an_upstream_that_may_be_mended() -> None:
+    core, asked = joined(head=0)
+    (put,) = core.answered(asked.number, RecordsAnswer(1, JournalPlace(3, b"a" * 16), three(1)), 0.0)
+    assert core.refused(put.number, OtherRecords("m", 0, 3), 0.0) == []
+    assert core.tick(4.9) == []
+    (asked,) = core.tick(5.0)
+    assert isinstance(asked, AskUpstream)
+    (put,) = core.answered(asked.number, RecordsAnswer(1, JournalPlace(3, b"a" * 16), three(1)), 5.0)
+    core.refused(put.number, OtherRecords("m", 0, 3), 5.0)
+    assert core.tick(14.9) == []
+    assert core.tick(15.0) != []
+
+
 def test_what_is_collected_has_a_bound() -> None:
     core, asked = joined(head=4)
     large = SentRecord(0, (SentInsert("other", 1, bytes(COLLECTED_BYTES), 1),))

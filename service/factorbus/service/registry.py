@@ -1,6 +1,6 @@
 """The maps of a service: found on disk, made, dropped, each with its host and its place on the bus.
 
-Made and dropped on the control thread only, or before it has work; looked up from any thread.
+Made and dropped on the control thread only; what is on disk is opened before it has work.  Looked up from any thread.
 """
 
 import logging
@@ -172,7 +172,7 @@ class Maps:
         """Have maps of these names; one that is on disk and does not open keeps the others from nothing."""
         for name in names:
             if name not in self._unopened:
-                self.create(name, None)
+                self._control.do(self.create, name, None)  # clients, which are heard by now, may ask for it as well
 
     def fork(self, asker: Asker, fork: Fork) -> None:
         """Have a new map begin as another one is, and answer with its row: `forked` goes on.  Raises Problem."""

@@ -39,6 +39,25 @@ class SerialExecutor:
             except Exception:
                 self._log(call)
 
+    def do(self, call: Callable[..., object], *arguments: Any) -> None:
+        """Have `call(*arguments)` run behind all that was handed in before, and return when it is done.
+
+        Raises what it raises.
+        """
+        done: queue.SimpleQueue[Exception | None] = queue.SimpleQueue()
+
+        def run() -> None:
+            try:
+                call(*arguments)
+            except Exception as fault:
+                done.put(fault)
+            else:
+                done.put(None)
+
+        self.hand(run)
+        if (fault := done.get()) is not None:
+            raise fault
+
     def close(self) -> None:
         """Return when all that was handed in is done and the thread has ended."""
         self._calls.put(None)

@@ -21,6 +21,7 @@ SEND_S = 0.1  # between what is sent: inserts of that time go together, in fewer
 POLL_S = 1.0  # with nothing to send, upstream is asked so often
 PAUSES_S = (0.1, 1.0)  # after silence, doubling
 REFUSED_S = 5.0  # after a refusal that time alone will not mend
+PUT_PAUSES_S = (0.2, 60.0)  # after what came could not be put in, doubling: each try makes again what is here alone
 LEAST_BYTES = 4 << 10
 COLLECTED_BYTES = 64 << 20  # of what came from upstream and is not yet put in; the next answer goes beyond it
 _RECORD_BYTES = 200  # of a record without its messages
@@ -80,6 +81,7 @@ class UpstreamCore:
         self._more = False
         self._coming: list[SentRecord] = []  # from upstream, up to `_come`
         self._come, self._coming_bytes = place, 0
+        self._put_again, self._put_at, self._put_pause_s = False, -math.inf, PUT_PAUSES_S[0]
         self._not_before, self._pause_s, self._heard = -math.inf, PAUSES_S[0], -math.inf
         self._most_bytes = MOST_BYTES
 
@@ -105,6 +107,8 @@ class UpstreamCore:
         """In how many seconds `tick` is to be called; None: only something that happens will change anything."""
         if not self._alive or self._doing:
             return None
+        if self._put_again:
+            return max(self._put_at - now, 0.0)
         wait_s = SEND_S if self.head > self.place.record and not self._must_ask else POLL_S
         at = self._heard + wait_s if self._joined and not self._must_ask else now
         return max(at, self._not_before, now) - now
@@ -156,6 +160,7 @@ class UpstreamCore:
             return []
         self._doing = ""
         self.place, self.head, self._must_ask = place, head, self._more
+        self._put_pause_s, self.problem = PUT_PAUSES_S[0], None
         self._forget_what_comes()
         self._unsure = max(self._unsure, head) if self._more else place.record
         return self._go_on(now)
@@ -165,10 +170,12 @@ class UpstreamCore:
         if number != self._number or not self._doing:
             return []
         doing, self._doing, self._must_ask = self._doing, "", True
-        if doing != "put":
-            self._heard_from(now)
+        if doing == "put":
+            self._not_put_in(problem, now)
+            return []
+        self._heard_from(now)
         collected = bool(self._coming)
-        if doing == "put" or problem.code == "other_records":
+        if problem.code == "other_records":
             self._forget_what_comes()
         if problem.code == "records_moved_on" and doing == "send":
             return self._go_on(now)
@@ -176,7 +183,6 @@ class UpstreamCore:
             return self._go_on(now)
         if problem.code == "other_records" and self.place.record:
             self.place, self._unsure = JournalPlace(), self.head
-            self._forget_what_comes()
             return self._go_on(now)
         if problem.code == "unknown_map":
             self._joined = False
@@ -199,6 +205,8 @@ class UpstreamCore:
     def _go_on(self, now: float) -> list[UpstreamEffect]:
         if not self._alive or self._doing or now < self._not_before:
             return []
+        if self._put_again:
+            return self._put_in() if now >= self._put_at else []
         if not self._joined:
             self._begin("join")
             return [JoinUpstream(self._number)]
@@ -212,8 +220,20 @@ class UpstreamCore:
         return []
 
     def _put_in(self) -> list[UpstreamEffect]:
+        self._put_again = False
         self._begin("put")
         return [PutIn(self._number, self.place, tuple(self._coming), self._come)]
+
+    def _not_put_in(self, problem: Any, now: float) -> None:
+        """What time may mend is tried again with what is here; else upstream is asked again, which may be another."""
+        if problem.code in _RETRIED:
+            self._put_again = True
+        else:
+            self._forget_what_comes()
+            self._put_pause_s = max(self._put_pause_s, REFUSED_S)
+        self.problem = problem
+        self._put_at = self._not_before = now + self._put_pause_s
+        self._put_pause_s = min(2 * self._put_pause_s, PUT_PAUSES_S[1])
 
     def _forget_what_comes(self) -> None:
         self._coming, self._come, self._coming_bytes = [], self.place, 0

@@ -103,6 +103,13 @@ class _Followed:
         self.behind = self.rebased = self.refused = 0
         self.same_bits = True
         self.sent_bytes = self.received_bytes = 0
+        self._said = ""
+
+    def say(self, text: str, *of: object) -> None:
+        """Log what is wrong, unless it is what was said last."""
+        if (said := text % of) != self._said:
+            log.warning("%s", said, extra={"map": self.host.core.name})
+        self._said = said
 
 
 class Replicas:
@@ -329,7 +336,7 @@ class Replicas:
             return  # the map was dropped meanwhile, and there may be another one of its name
         if isinstance(result, Problem):
             if result.code not in ("records_moved_on", "busy"):
-                log.warning("map %s: upstream %s: %s", followed.host.core.name, self._endpoint, result)
+                followed.say("map %s: upstream %s: %s", followed.host.core.name, self._endpoint, result)
             self._do(followed, core.refused(number, result, now))
             return
         if not isinstance(result, bytes):
@@ -358,10 +365,15 @@ class Replicas:
             self._events.put(lambda: self._grafted(followed, effect, grafted))
 
         def refused(problem: Any) -> None:
-            self._events.put(lambda: self._told(followed, effect.number, problem, None))
+            self._events.put(lambda: self._not_put_in(followed, effect, problem))
 
         graft = Graft(effect.after, effect.records, effect.place, heard)
         followed.host.graft(_LocalAsker(refused), graft)
+
+    def _not_put_in(self, followed: _Followed, effect: PutIn, problem: Any) -> None:
+        name, upstream = followed.host.core.name, self._endpoint
+        followed.say("map %s: what came from upstream %s is not put in: %s", name, upstream, problem)
+        self._do(followed, followed.core.refused(effect.number, problem, time.monotonic()))
 
     def _grafted(self, followed: _Followed, effect: PutIn, grafted: Grafted) -> None:
         followed.rebased += bool(grafted.rebased)
