@@ -325,7 +325,7 @@ def test_what_cannot_be_put_in_is_tried_again_later_and_later_and_is_not_asked_f
         now += due
         pauses.append(round(due, 3))
         (put,) = core.tick(now)
-    assert pauses == [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 60.0, 60.0, 60.0]
+    assert pauses == [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0]
     core.put(put.number, JournalPlace(3, b"a" * 16), 3, now)
     assert (core.problem, core.place.record) == (None, 3)
 

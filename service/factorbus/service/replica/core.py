@@ -21,7 +21,7 @@ SEND_S = 0.1  # between what is sent: inserts of that time go together, in fewer
 POLL_S = 1.0  # with nothing to send, upstream is asked so often
 PAUSES_S = (0.1, 1.0)  # after silence, doubling
 REFUSED_S = 5.0  # after a refusal that time alone will not mend
-PUT_PAUSES_S = (0.2, 60.0)  # after what came could not be put in, doubling: each try makes again what is here alone
+PUT_PAUSES_S = (0.2, 10.0, 60.0)  # after what came could not be put in, doubling; where time alone will not mend it
 LEAST_BYTES = 4 << 10
 COLLECTED_BYTES = 64 << 20  # of what came from upstream and is not yet put in; the next answer goes beyond it
 _RECORD_BYTES = 200  # of a record without its messages
@@ -226,14 +226,16 @@ class UpstreamCore:
 
     def _not_put_in(self, problem: Any, now: float) -> None:
         """What time may mend is tried again with what is here; else upstream is asked again, which may be another."""
+        _, longest_s, unmended_s = PUT_PAUSES_S
         if problem.code in _RETRIED:
             self._put_again = True
         else:
+            longest_s = unmended_s
             self._forget_what_comes()
             self._put_pause_s = max(self._put_pause_s, REFUSED_S)
         self.problem = problem
         self._put_at = self._not_before = now + self._put_pause_s
-        self._put_pause_s = min(2 * self._put_pause_s, PUT_PAUSES_S[1])
+        self._put_pause_s = min(2 * self._put_pause_s, longest_s)
 
     def _forget_what_comes(self) -> None:
         self._coming, self._come, self._coming_bytes = [], self.place, 0
