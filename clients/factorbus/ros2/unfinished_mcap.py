@@ -81,7 +81,7 @@ class UnfinishedMcap:
         cut = self._cut_record()
         if cut is None or not cut.is_chunk:
             return "before its first chunk"
-        return f"{cut.lacking} bytes before its first chunk does"
+        return f"{cut.missing_bytes} bytes before its first chunk does"
 
     def _records(self) -> Iterator[Any]:
         """Raises what the library does where they end."""
@@ -114,11 +114,11 @@ class UnfinishedMcap:
 
 
 class _CutRecord(NamedTuple):
-    """Where it begins, and how many bytes of it are lacking."""
+    """Where it begins, and how many of its bytes are not there."""
 
     at: int
     is_chunk: bool
-    lacking: int
+    missing_bytes: int
 
 
 def _whole_records(cut: bytes) -> bytes:
