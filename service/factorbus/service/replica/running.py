@@ -18,7 +18,7 @@ from factorbus.journal.records import JournalRecord
 from factorbus.journal.rewriting import UpstreamPlace, upstream_of
 from factorbus.journal.store import open_store
 from factorbus.proto import codec, keys
-from factorbus.proto.problems import Internal, Problem
+from factorbus.proto.problems import Internal, Problem, Unavailable
 from factorbus.proto.records import (
     MOST_NAMED,
     MOST_RECORDS,
@@ -132,7 +132,7 @@ class Replicas:
         self._alive, self._open_at = False, 0.0
         self._events: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._ticking = False
-        self._no_session = ""  # why there is none
+        self._no_session = self._said_of_session = ""  # why there is none, beyond that nobody answers; what was logged
         self._unfollowed: dict[str, str] = {}  # maps that cannot be followed, and why
         self._thread = threading.Thread(target=self._run, name="upstream", daemon=True)
         self._thread.start()
@@ -200,9 +200,10 @@ class Replicas:
                 self._session = self._open_session(lambda alive: self._events.put(lambda: self._seen(alive)))
                 self._no_session = ""
             except Problem as problem:
-                if self._no_session != problem.message:
-                    log.warning("upstream %s: %s; going on alone, and trying again", self._endpoint, problem)
-                self._no_session, self._open_at = problem.message, time.monotonic() + _OPENING_S
+                if self._said_of_session != problem.message:
+                    log.warning("going on alone, and trying again: %s", problem)
+                self._said_of_session, self._open_at = problem.message, time.monotonic() + _OPENING_S
+                self._no_session = "" if isinstance(problem, Unavailable) else problem.message
         hosts = self._hosts()
         for name in [name for name, followed in self._maps.items() if hosts.get(name) is not followed.host]:
             del self._maps[name]
