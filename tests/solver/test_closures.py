@@ -21,8 +21,9 @@ from factorbus.solver.closures.evidence import (
     judge_each,
     judge_pairs,
 )
-from factorbus.solver.closures.gated import CONTRADICTED, GatedSolver
-from factorbus.solver.closures.ledger import ACCEPTED, REJECTED, RESTORED, SUSPECT, UnknownClosure
+from factorbus.solver.closures.gated import GatedSolver
+from factorbus.solver.closures.judging import CONTRADICTED, closure_numbers
+from factorbus.solver.closures.ledger import ACCEPTED, REJECTED, RESTORED, SUSPECT, Closure, NotAClosure
 from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, tangent_of
 from factorbus.solver.closures.policy import ClosurePolicy
 
@@ -187,6 +188,13 @@ def driven(length: int = 8) -> GatedSolver:
     return made
 
 
+def believe(made: GatedSolver, closure: Closure, reason: str) -> None:
+    """It is in, and may go out again."""
+    made.accept(closure.factor_id)
+    closure.state, closure.reason = ACCEPTED, reason
+    made.ledger.of_kind[closure.factor.kind].mark(closure)
+
+
 def test_a_closure_that_the_map_expects_goes_in_and_another_is_a_suspect() -> None:
     made = driven()
     right = made.insert(closure(1, 16, [0.02, 0.0, math.pi]))
@@ -194,7 +202,7 @@ def test_a_closure_that_the_map_expects_goes_in_and_another_is_a_suspect() -> No
     assert not right.suspects
     wrong = made.insert(closure(2, 15, [3.0, 0.0, math.pi]))
     (suspect,) = wrong.suspects
-    assert (suspect.state, suspect.reason, suspect.factor_id) == (SUSPECT, "improbable", -1)
+    assert (suspect.state, suspect.reason, suspect.factor_id) == (SUSPECT, "improbable", 17)
     assert suspect.distance > 100.0
     assert 0.0 < suspect.chance < 0.02
     assert made.suspects() == [suspect]
@@ -205,15 +213,15 @@ def test_what_a_user_says_is_for_good() -> None:
     made = driven()
     made.insert(closure(1, 16, [0.02, 0.0, math.pi]))
     made.insert(closure(2, 15, [3.0, 0.0, math.pi]))
-    made.reject(0)
-    made.accept(1)
+    made.reject(16)
+    made.accept(17)
     assert [(c.state, c.is_in) for c in made.closures] == [(REJECTED, False), (RESTORED, True)]
     for k in range(3, 7):
         made.insert(closure(k, 17 - k, [0.0, 0.0, math.pi]))
     assert [(c.state, c.is_in) for c in made.closures[:2]] == [(REJECTED, False), (RESTORED, True)]
-    assert made.accept(1) is None
-    assert made.reject(0) is None
-    with pytest.raises(UnknownClosure, match="there is no closure 6: they are 0 to 5"):
+    assert made.accept(17) is None
+    assert made.reject(16) is None
+    with pytest.raises(NotAClosure, match="factor 6 is no loop closure that the map tests: it tests 6 closures"):
         made.accept(6)
 
 
@@ -222,13 +230,12 @@ def test_a_false_one_that_is_in_goes_out_when_others_contradict_it() -> None:
     made.insert(closure(2, 15, [1.0, 0.0, math.pi]))
     false = made.closures[0]
     assert not false.is_in
-    made.accept(0)
-    made._ledgers["between_se2"].move(false, ACCEPTED, "passed", 0)  # as if it had passed by chance
+    believe(made, false, "passed")  # as if it had passed by chance
     states = []
     for k in (1, 3, 4, 5, 6):
         report = made.insert(closure(k, 17 - k, [0.0, 0.0, math.pi]))
-        states += [(c.number, c.reason) for c in report.contradicted]
-    assert states == [(0, CONTRADICTED)]
+        states += [(c.factor_id, c.reason) for c in report.contradicted]
+    assert states == [(16, CONTRADICTED)]
     assert not false.is_in
     assert all(c.is_in for c in made.closures[1:])
 
@@ -238,8 +245,7 @@ def test_rivals_that_agree_at_two_places_replace_what_they_contradict() -> None:
     made.insert(closure(20, 61, [0.3, 3.0, math.pi - 0.15]))
     false = made.closures[0]
     assert (false.reason, false.is_in) == ("unsure", False)  # eighty metres of odometry exclude nothing
-    made.accept(0)
-    made._ledgers["between_se2"].move(false, ACCEPTED, "agrees", 0)  # as if another false one had agreed with it
+    believe(made, false, "agrees")  # as if another false one had agreed with it
     for k in (18, 17, 16, 6, 7, 5, 4, 3):
         made.insert(closure(k, 81 - k, [0.0, 0.0, math.pi]))
     assert (false.state, false.reason) == (SUSPECT, "improbable")
@@ -297,10 +303,10 @@ def test_accepted_ones_are_judged_against_the_map_without_them() -> None:
     made = driven()
     for k in (1, 3, 5):
         made.insert(closure(k, 17 - k, [0.01 * k, 0.0, math.pi]))
-    ledger = made._ledgers["between_se2"]
-    distance = judge_accepted(made._numbers(ledger, np.array([1])))[0]
-    made.reject(1)
-    alone = judge_each(made._numbers(ledger, np.array([1])), _GATE, _SPREADS).distance[0]
+    ledger = made.ledger.of_kind["between_se2"]
+    distance = judge_accepted(closure_numbers(made.solver, ledger, np.array([1])))[0]
+    made.reject(17)
+    alone = judge_each(closure_numbers(made.solver, ledger, np.array([1])), _GATE, _SPREADS).distance[0]
     assert distance == pytest.approx(alone, rel=0.02)  # but for the second order of headings
 
 

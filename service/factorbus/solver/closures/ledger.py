@@ -1,18 +1,26 @@
-"""All closures of one kind that a map was given, as columns, and what has become of each."""
+"""All closures that a map was given, as columns, and what has become of each.
 
+A closure that is not believed keeps its factor's id, and is no factor of the map meanwhile: it is kept here.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.errors import SolverError
-from factorbus.solver.graph.factor_graph import with_room
+from factorbus.solver.graph.factor_graph import FactorGraph, with_room
 from factorbus.solver.graph.groups import FactorGroup, FactorsLike
 from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.wording import counted
 
 ACCEPTED, SUSPECT, REJECTED, RESTORED = "accepted", "suspect", "rejected", "restored"
-NEW = "new"
+CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
+NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
+_BELIEVED = {ACCEPTED, RESTORED}
 _COLUMNS = ("z", "noise", "weight", "ends", "looked", "is_suspect", "is_tested")
 
 
@@ -20,37 +28,66 @@ _COLUMNS = ("z", "noise", "weight", "ends", "looked", "is_suspect", "is_tested")
 class Closure:
     """One closure.
 
-    number: in the order they came, of all kinds; row: in its ledger.  came, changed, looked: steps, when it came, when
-    its state last changed, when it was last looked at.  reason: why its state is what it is.  distance: d², chance: of
-    a false one to be within the gate, both when it was last looked at.  factor_id: in the solver, −1: it has none.
+    factor_id: its id, whether it is in or not; row: in its ledger.  came, changed: revisions, when it came, and when its
+    state last changed.  reason: why its state is what it is.  distance: d², chance: of a false one to be within the gate,
+    both when it was last looked at.  tried: the newest rival when it was last taken out on trial.
     """
 
-    number: int
+    factor_id: int
     row: int
     factor: FactorGroup
     came: int
     state: str = SUSPECT
-    reason: str = "new"
+    reason: str = NEW
     distance: float = float("nan")
     chance: float = float("nan")
     changed: int = 0
-    looked: int = 0
-    factor_id: int = -1
+    tried: int = -1
 
     @property
     def is_in(self) -> bool:
         """Whether the estimate has it."""
-        return self.factor_id >= 0
+        return self.state in _BELIEVED
+
+    @property
+    def keys(self) -> tuple[int, int]:
+        """The poses it is between."""
+        first, second = self.factor.keys[0].tolist()
+        return first, second
 
 
-class UnknownClosure(SolverError):
-    """A number that no closure has."""
+class NotAClosure(SolverError):
+    """A factor that is no closure which the map tests."""
 
-    code = "unknown_closure"
+    code = "not_a_closure"
 
-    def __init__(self, number: int, count: int) -> None:
-        have = f"they are 0 to {count - 1}" if count else "there is none yet"
-        super().__init__(f"there is no closure {number}: {have}; `closures` has them", closure=number)
+    def __init__(self, factor: int, count: int) -> None:
+        have = f"it tests {counted(count, 'closure')}, which ask/suspects lists" if count else "it tests none so far"
+        super().__init__(f"factor {factor} is no loop closure that the map tests: {have}", factor=factor)
+
+
+class SwitchedOff(SolverError):
+    """A change of a closure that is not in the estimate."""
+
+    code = "switched_off"
+
+    def __init__(self, change: str, factor: int, state: str) -> None:
+        super().__init__(
+            f"{change}: factor {factor} is a loop closure that the estimate does not have ({state}); accept it first, "
+            "or remove it",
+            factor=factor, state=state,
+        )  # fmt: skip
+
+
+class ClosureVerdicts(NamedTuple):
+    """What closures are from now on, each (n,): ids, states, reasons, d², chances, and rivals that were tried."""
+
+    factors: I64
+    states: tuple[str, ...]
+    reasons: tuple[str, ...]
+    distance: F64
+    chance: F64
+    tried: I64
 
 
 class Ledger:
@@ -58,7 +95,7 @@ class Ledger:
 
     z (n, k, k), noise, weight (n, d, d): what was measured, Ω⁻¹ and Ω in its tangent space, metres and radians.
     ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out.
-    looked (n,): the step.  All have room behind for more.
+    looked (n,): when it was last looked at, in looks.  All have room behind for more.
     """
 
     def __init__(self, kind: str) -> None:
@@ -69,23 +106,26 @@ class Ledger:
         self.ends, self.looked = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
         self.is_suspect, self.is_tested = np.zeros(0, bool), np.zeros(0, bool)
 
-    def add(self, factor: FactorGroup, number: int, ends: I64, step: int) -> Closure:
-        """One more; a suspect at first."""
-        n = len(self.closures)
+    def add(self, closure: Closure, ends: Sequence[int], looked: int) -> None:
+        """One more."""
+        n = closure.row = len(self.closures)
         if n == len(self.z):
             for name in _COLUMNS:
                 setattr(self, name, with_room(getattr(self, name), n + 1))
-        self.z[n] = motions_of_poses(factor.measured)[0]
-        self.noise[n], self.weight[n] = _certainty(factor, self.dim)
-        self.ends[n], self.looked[n] = ends, step
-        self.closures.append(Closure(number, n, factor, step))
-        self.move(self.closures[n], SUSPECT, NEW, step)
-        return self.closures[n]
+        self.closures.append(closure)
+        self.ends[n], self.looked[n] = ends, looked
+        self.measure(closure, closure.factor)
+        self.mark(closure)
 
-    def move(self, closure: Closure, state: str, reason: str, step: int) -> None:
-        """Its state changes."""
-        closure.state, closure.reason, closure.changed = state, reason, step
-        self.is_suspect[closure.row], self.is_tested[closure.row] = state == SUSPECT, state == ACCEPTED
+    def measure(self, closure: Closure, factor: FactorGroup) -> None:
+        """What it measures, and how well."""
+        closure.factor = factor
+        self.z[closure.row] = motions_of_poses(factor.measured)[0]
+        self.noise[closure.row], self.weight[closure.row] = _certainty(factor, self.dim)
+
+    def mark(self, closure: Closure) -> None:
+        """Its state has changed."""
+        self.is_suspect[closure.row], self.is_tested[closure.row] = closure.state == SUSPECT, closure.state == ACCEPTED
 
     def suspects(self) -> I64:
         """Rows."""
@@ -94,6 +134,143 @@ class Ledger:
     def tested(self) -> I64:
         """Rows."""
         return np.flatnonzero(self.is_tested[: len(self.closures)])
+
+    def unjudged(self) -> I64:
+        """Rows of those that nobody has looked at."""
+        return np.array([row for row in self.suspects().tolist() if self.closures[row].reason == NEW], np.int64)
+
+
+class ClosureLedger:
+    """All closures of a map, in the order in which they came.
+
+    looks: how often some were looked at.  moved_at: the look at which some went in or out last.
+    """
+
+    def __init__(self) -> None:
+        self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
+        self.of_factor: dict[int, Closure] = {}
+        self.looks = self.moved_at = 0
+
+    @property
+    def closures(self) -> list[Closure]:
+        """All of them."""
+        return list(self.of_factor.values())
+
+    def counts(self) -> dict[str, int]:
+        """How many are in each state."""
+        states = [closure.state for closure in self.of_factor.values()]
+        return {state: states.count(state) for state in CLOSURE_STATES}
+
+    def add(self, factor: FactorGroup, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
+        """A new one: a suspect that nobody has looked at."""
+        closure = Closure(factor_id, 0, factor, revision, changed=revision)
+        self.of_kind[factor.kind].add(closure, [graph.find(key) for key in closure.keys], self.looks)
+        self.of_factor[factor_id] = closure
+        return closure
+
+    def named(self, factors: Iterable[int]) -> list[Closure]:
+        """Those with these ids.  Raises NotAClosure."""
+        found = []
+        for factor in factors:
+            if (closure := self.of_factor.get(factor)) is None:
+                raise NotAClosure(factor, len(self.of_factor))
+            found.append(closure)
+        return found
+
+    def said(self, factors: Iterable[int], state: str) -> ClosureVerdicts:
+        """That a user has the last word on these: `state` for good.  Raises NotAClosure."""
+        named = self.named(factors)
+        return verdicts_of((c, state, BY_USER, c.distance, c.chance, c.tried) for c in named)
+
+    def failed(self, verdicts: ClosureVerdicts) -> ClosureVerdicts:
+        """The same where the step that they asked for failed: what was to go in is a suspect, the rest stays."""
+        rows = []
+        for k, c in enumerate(self.named(verdicts.factors.tolist())):
+            state, reason = verdicts.states[k], verdicts.reasons[k]
+            if (state in _BELIEVED) != c.is_in:
+                state, reason = (c.state, c.reason) if c.is_in else (SUSPECT, FAILED)
+            rows.append((c, state, reason, verdicts.distance[k], verdicts.chance[k], int(verdicts.tried[k])))
+        return verdicts_of(rows)
+
+    def note(self, verdicts: ClosureVerdicts, revision: int) -> list[Closure]:
+        """They are so from now on; gives those whose state is another than before.  Raises NotAClosure."""
+        self.looks += 1
+        changed, moved = [], False
+        for k, c in enumerate(self.named(verdicts.factors.tolist())):
+            was, ledger = (c.state, c.is_in), self.of_kind[c.factor.kind]
+            c.state, c.reason, c.tried = verdicts.states[k], verdicts.reasons[k], int(verdicts.tried[k])
+            c.distance, c.chance = float(verdicts.distance[k]), float(verdicts.chance[k])
+            ledger.looked[c.row] = self.looks
+            ledger.mark(c)
+            if c.state != was[0]:
+                c.changed = revision
+                changed.append(c)
+            moved = moved or c.is_in != was[1]
+        if moved:
+            self.moved_at = self.looks
+        return changed
+
+    def forget(self, gone: Iterable[int], graph: FactorGraph) -> None:
+        """Those with these ids are no more, and variables of the map may have other numbers."""
+        for factor in gone:
+            del self.of_factor[factor]
+        looked = {c.factor_id: int(self.of_kind[c.factor.kind].looked[c.row]) for c in self.of_factor.values()}
+        self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
+        for c in self.of_factor.values():
+            self.of_kind[c.factor.kind].add(c, [graph.find(key) for key in c.keys], looked[c.factor_id])
+
+    def dump(self) -> dict[str, Any]:
+        """All of it, as plain values."""
+        all_ = self.closures
+        state: dict[str, Any] = {"looks": self.looks, "moved_at": self.moved_at}
+        for name in ("factor_id", "came", "changed", "tried"):
+            state[name] = np.array([getattr(c, name) for c in all_], np.int64)
+        for name in ("state", "reason"):
+            state[name] = [getattr(c, name) for c in all_]
+        state |= {name: np.array([getattr(c, name) for c in all_], np.float64) for name in ("distance", "chance")}
+        state["looked"] = np.array([self.of_kind[c.factor.kind].looked[c.row] for c in all_], np.int64)
+        state["kind"], state["loss"] = [c.factor.kind for c in all_], [c.factor.loss for c in all_]
+        scales = [c.factor.scale for c in all_]
+        state["scale"] = np.array([0.0 if scale is None else float(scale[0]) for scale in scales])
+        state["keys"] = np.array([c.keys for c in all_], np.int64).reshape(-1, 2)
+        for name in ("measured", "information"):
+            state[name] = np.concatenate([np.empty(0), *(getattr(c.factor, name)[0] for c in all_)])
+        return state
+
+    def load(self, state: Mapping[str, Any], graph: FactorGraph) -> None:
+        """Be what one was that gave `state`, of this graph.  Raises KeyError, ValueError."""
+        self.__init__()
+        self.looks, self.moved_at = int(state["looks"]), int(state["moved_at"])
+        here = {"measured": 0, "information": 0}
+        for k, kind in enumerate(state["kind"]):
+            numbers = []
+            for name, size in (("measured", 3 if kind == "between_se2" else 7), ("information", _TRIANGLES[kind])):
+                numbers.append(np.array(state[name][here[name] : here[name] + size]).reshape(1, size))
+                here[name] += size
+            loss = state["loss"][k]
+            scale = np.array([float(state["scale"][k])]) if loss else None
+            factor = FactorGroup(kind, np.array(state["keys"][k : k + 1]), numbers[0], numbers[1], loss, scale)
+            ids = [int(state[name][k]) for name in ("factor_id", "came", "changed", "tried")]
+            told = state["state"][k], state["reason"][k], float(state["distance"][k]), float(state["chance"][k])
+            closure = Closure(ids[0], 0, factor, ids[1], *told, ids[2], ids[3])
+            self.of_kind[kind].add(closure, [graph.find(key) for key in closure.keys], int(state["looked"][k]))
+            self.of_factor[closure.factor_id] = closure
+
+
+_TRIANGLES = {"between_se2": 6, "between_se3": 21}
+
+
+def verdicts_of(rows: Iterable[tuple[Closure, str, str, float, float, int]]) -> ClosureVerdicts:
+    """(closure, state, reason, d², chance, tried) of each, as columns."""
+    listed = list(rows)
+    return ClosureVerdicts(
+        np.array([row[0].factor_id for row in listed], np.int64),
+        tuple(row[1] for row in listed),
+        tuple(row[2] for row in listed),
+        np.array([row[3] for row in listed], np.float64),
+        np.array([row[4] for row in listed], np.float64),
+        np.array([row[5] for row in listed], np.int64),
+    )
 
 
 def pick_rows(group: FactorsLike, chosen: np.ndarray | I64) -> FactorGroup:
