@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive.dense_poses import pose_matrix, pose_vector
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, errors
@@ -28,7 +29,7 @@ from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, 
 from factorbus.solver.closures.policy import ClosurePolicy
 
 _SPREADS = (FalseSpread(5.0, 0.5), FalseSpread(30.0, math.pi))
-_GATE = 16.0
+_GATE = 16.3  # 99.9 % of χ² of three numbers
 seeds, spaces = st.integers(0, 2**32 - 1), st.sampled_from([3, 6])
 
 
@@ -107,7 +108,7 @@ def test_half_a_turn_has_a_tangent_of_that_length() -> None:
 @given(seed=seeds, d=spaces)
 def test_one_closure_against_the_map_is_as_with_dense_derivatives(seed: int, d: int) -> None:
     c = closures_between(3, d, np.random.default_rng(seed), 1e-4)
-    found = judge_each(c, _GATE, _SPREADS)
+    found = judge_each(c, _SPREADS)
     for k in range(3):
         r = tangent(np.linalg.inv(c.z[k]) @ np.linalg.inv(c.a[k]) @ c.b[k])
         z = c.z[k]
@@ -122,7 +123,7 @@ def test_one_closure_against_the_map_is_as_with_dense_derivatives(seed: int, d: 
 def test_two_closures_against_each_other_are_as_with_dense_derivatives(seed: int, d: int) -> None:
     c = closures_between(3, d, np.random.default_rng(seed), 1e-4)
     i, j = np.triu_indices(3, 1)
-    found = judge_pairs(c, i, j, _GATE, _SPREADS)
+    found = judge_pairs(c, i, j, _SPREADS)
     for k, (p, q) in enumerate(zip(i.tolist(), j.tolist(), strict=True)):
         ends, measured = [c.a[p], c.b[p], c.a[q], c.b[q]], [c.z[p], c.z[q]]
         J = derived(lambda *x, measured=measured: loop_of(*x, *measured), ends, d)
@@ -139,14 +140,29 @@ def loop_of(*T: np.ndarray) -> np.ndarray:
     return tangent(np.linalg.inv(z) @ np.linalg.inv(a) @ e @ w @ np.linalg.inv(f) @ b)
 
 
-def test_chances_are_shares_of_where_false_ones_are() -> None:
+@pytest.mark.parametrize("off", [0.0, 0.3])
+def test_odds_are_densities_of_false_ones_for_that_of_right_ones(off: float) -> None:
     here, noise = np.eye(3)[None], np.diag([0.01, 0.04, 0.0025])[None]
-    c = ClosureNumbers(here, here, here, noise, np.zeros((6, 6)))
-    near, far = judge_each(c, _GATE, _SPREADS).chance[0]
-    assert near == pytest.approx((4 * 0.1 / 5) * (4 * 0.2 / 5) * (4 * 0.05 / 0.5))
-    assert far == pytest.approx((4 * 0.1 / 30) * (4 * 0.2 / 30) * (4 * 0.05 / math.pi))
-    sure = judge_each(c._replace(known=100.0 * np.eye(6)), _GATE, _SPREADS).chance[0]
-    assert sure.tolist() == [1.0, 1.0]  # a map that knows nothing excludes nothing
+    c = ClosureNumbers(here, here, pose_matrix(np.array([off, -off, 0.0]))[None], noise, np.zeros((6, 6)))
+    found = judge_each(c, _SPREADS)
+    right = multivariate_normal(np.zeros(3), noise[0]).pdf([-off, off, 0.0])
+    false = [1.0 / (10.0 * 10.0 * 1.0), 1.0 / (60.0 * 60.0 * 2 * math.pi)]
+    np.testing.assert_allclose(found.chance[0], np.minimum(np.array(false) / right, 1.0), rtol=1e-9)
+    assert found.chance[0, 0] < 1.0
+    unsure = judge_each(c._replace(known=100.0 * np.eye(6)), _SPREADS).chance[0]
+    assert unsure.tolist() == [1.0, 1.0]  # a map that knows nothing excludes nothing
+
+
+def test_half_of_the_distance_counts_in_space() -> None:
+    here, noise = np.eye(4)[None], np.diag([0.01] * 3 + [0.0025] * 3)[None]
+    known = np.zeros((12, 12))
+    near = judge_each(ClosureNumbers(here, here, here, noise, known), _SPREADS)
+    off = here.copy()
+    off[0, 0, 3] = 0.2
+    far = judge_each(ClosureNumbers(here, here, off, noise, known), _SPREADS)
+    assert far.distance[0] == pytest.approx(4.0)
+    assert far.chance[0, 0] / near.chance[0, 0] == pytest.approx(math.e)
+    assert near.chance[0, 0] == pytest.approx((2 * math.pi) ** 1.5 * 0.1 * 0.1 * 0.05 / 100.0)
 
 
 @settings(max_examples=50, deadline=None)
@@ -200,11 +216,12 @@ def test_a_closure_that_the_map_expects_goes_in_and_another_is_a_suspect() -> No
     right = made.insert(closure(1, 16, [0.02, 0.0, math.pi]))
     assert [c.state for c in right.accepted] == [ACCEPTED]
     assert not right.suspects
+    assert right.accepted[0].chance < 1e-3
     wrong = made.insert(closure(2, 15, [3.0, 0.0, math.pi]))
     (suspect,) = wrong.suspects
     assert (suspect.state, suspect.reason, suspect.factor_id) == (SUSPECT, "improbable", 17)
     assert suspect.distance > 100.0
-    assert 0.0 < suspect.chance < 0.02
+    assert suspect.chance == 1.0
     assert made.suspects() == [suspect]
     assert made.solver.factor_count == 17
 
@@ -306,7 +323,7 @@ def test_accepted_ones_are_judged_against_the_map_without_them() -> None:
     ledger = made.ledger.of_kind["between_se2"]
     distance = judge_accepted(closure_numbers(made.solver, ledger, np.array([1])))[0]
     made.reject(17)
-    alone = judge_each(closure_numbers(made.solver, ledger, np.array([1])), _GATE, _SPREADS).distance[0]
+    alone = judge_each(closure_numbers(made.solver, ledger, np.array([1])), _SPREADS).distance[0]
     assert distance == pytest.approx(alone, rel=0.02)  # but for the second order of headings
 
 

@@ -1,19 +1,21 @@
 """A solver whose closures are tested as they come, in process; a map on the bus does the same in its steps.
 
-    1  what a batch has besides closures goes in, one step
-    2  its closures are judged (`judging`), and what that says is done (`switching`), a step each time it moves any
+    1  a batch goes in with those of its closures that the map expects (`ahead`), one step
+    2  the others are judged, with suspects (`judging`), and what that says is done (`switching`), a step each time it
+       moves any
 
 All of it follows from what was inserted: the same batches give the same verdicts, and the same bits.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from factorbus.solver.changing import try_change, with_changes
+from factorbus.solver.closures.ahead import StagedBatch, enter_closures, restage, stage_with_believed
 from factorbus.solver.closures.judging import ClosureJudge
 from factorbus.solver.closures.ledger import REJECTED, RESTORED, SUSPECT, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.policy import ClosurePolicy
-from factorbus.solver.closures.switching import add_closures, check_whole, note_switch, planned_switch
+from factorbus.solver.closures.switching import note_switch, planned_switch
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.groups import Addition, BatchLike
 from factorbus.solver.options import Options
@@ -41,7 +43,7 @@ class GatedSolver:
         self.solver, self.judge = Solver(options), ClosureJudge(policy)
         self.ledger = ClosureLedger()
         self._joined = TrustedForest()
-        self._steps = 0
+        self._steps, self._limits = 0, self.judge.limits[3]
 
     @property
     def closures(self) -> list[Closure]:
@@ -53,23 +55,44 @@ class GatedSolver:
 
         Raises what `Solver.stage` and `step` do; nothing has changed then.
         """
-        split = self._joined.split(batch)
+        split, staged = self._joined.split(batch), None
         try:
             if split.closing:
-                check_whole(self.solver._graph, batch)
-            first = self.solver.stage(Addition(batch.variables, split.trusted))
-            report = self.solver.step()
+                staged = stage_with_believed(self.solver, self.ledger, batch, split, self.judge.policy, self._limits)
+            else:
+                self.solver.stage(batch)
+            report, staged = self._step(batch, staged)
         except SolverError:
             self._joined.forget()
             raise
         self._steps += 1
-        new = add_closures(self.solver._graph, self.ledger, split, first, self._steps)
-        before = {c.factor_id: c.is_in for c in self.closures} if new else {}
+        return GatedReport(report) if staged is None else self._judged(report, staged)
+
+    def _step(self, batch: BatchLike, staged: StagedBatch | None) -> tuple[StepReport, StagedBatch | None]:
+        """The step of what is staged; where it fails with closures, that without them."""
+        try:
+            return self.solver.step(), staged
+        except SolverError:
+            if staged is None or not any(staged.believed):
+                raise
+            staged = replace(staged, believed=[False] * len(staged.believed))
+            restage(self.solver, batch, staged)
+            return self.solver.step(), staged
+
+    def _judged(self, report: StepReport, staged: StagedBatch) -> GatedReport:
+        """The closures of a batch are written down and judged, now that the rest of it is in."""
+        new, moved = enter_closures(self.solver, self.ledger, staged, self._steps), dict[int, bool]()
         for kind in dict.fromkeys(c.factor.kind for c in new):
             for look in (self.judge.look, self.judge.look_back):
                 if (verdicts := look(self.solver, self.ledger, kind)) is not None:
+                    for c in self.ledger.named(verdicts.factors.tolist()):
+                        moved.setdefault(c.factor_id, c.is_in)
                     report = self._apply_or_keep(verdicts) or report
-        changed = [c for c in self.closures if c.is_in != before.get(c.factor_id, c.is_in)]
+        if not moved:
+            return GatedReport(report, tuple(c for c in new if c.is_in), tuple(c for c in new if not c.is_in))
+        for c in new:
+            moved[c.factor_id] = False
+        changed = [c for factor, was in sorted(moved.items()) if (c := self.ledger.of_factor[factor]).is_in != was]
         return GatedReport(
             report,
             tuple(c for c in changed if c.is_in),

@@ -3,6 +3,9 @@
     look        new ones and a few suspects are judged together (`choosing`); those that are believed are to go in
     look_back   of the closures that are in, the worst is judged against all others; an improbable one is to go out
 
+What cannot have changed is not computed anew: `Ledger.bound` says of one that is in, or that is improbable, what its d²
+is at most, or at least, while the map only gets factors.
+
 Where suspects agree that the map calls improbable, one place's closures are taken out of a copy of the solver, on
 trial: they are to stay out if more places' closures are believed then.
 
@@ -13,8 +16,16 @@ from typing import TypeAlias
 
 import numpy as np
 
-from factorbus.solver.closures.choosing import AGREES, PASSED, UNSURE, Chosen, choose_closures, closure_places
-from factorbus.solver.closures.evidence import ClosureNumbers, judge_accepted
+from factorbus.solver.closures.choosing import (
+    AGREES,
+    IMPROBABLE,
+    PASSED,
+    Chosen,
+    choose_closures,
+    closure_places,
+    limits_of,
+)
+from factorbus.solver.closures.evidence import ClosureNumbers, weights_without
 from factorbus.solver.closures.ledger import (
     ACCEPTED,
     SUSPECT,
@@ -28,17 +39,17 @@ from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, 
 from factorbus.solver.closures.policy import ClosurePolicy
 from factorbus.solver.closures.switching import without_factors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
-from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.errors import SolverError
-from factorbus.solver.kernels.jit.compile import I64
+from factorbus.solver.kernels.closures.ahead import list_companions, weigh_residuals
+from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
 
 CONTRADICTED = "contradicted"
 _NEWEST = 40  # suspects, or accepted ones, among which places are looked for
 _BELIEVED = {PASSED, AGREES}
-_EXPECTED = 3.0  # rᵀ Ω r of one accepted closure that is worth a look, for each of its numbers
-_WORST = 4  # accepted ones whose d² is computed in a step
+_PLANE_DIM, _SPACE_DIM = 3, 6
+_WORST = 8  # accepted ones whose d² is computed in a step
 _RETRY = 2  # rivals that have to be new before the same closures are tried again
 
 _Row: TypeAlias = tuple[Closure, str, str, float, float, int]
@@ -49,21 +60,27 @@ class ClosureJudge:
 
     def __init__(self, policy: ClosurePolicy | None = None) -> None:
         self.policy = policy or ClosurePolicy()
+        self.limits = {dims: limits_of(self.policy, dims) for dims in (_PLANE_DIM, _SPACE_DIM)}
 
     def look(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
-        """Judge new ones of a kind, with some suspects; None: there is no new one.  Raises SolverError."""
+        """Judge new ones of a kind, and suspects that may be believed now; None: none is.  Raises SolverError."""
         ledger = ledgers.of_kind[kind]
-        new = ledger.unjudged()
-        if not new.size:
+        suspects = ledger.suspects()
+        if not suspects.size:
             return None
-        looked_at = np.union1d(self._revisited(solver, ledgers, ledger, np.setdiff1d(ledger.suspects(), new)), new)
+        new = ledger.unjudged(suspects)
+        looked_at, settled = self._revisited(solver, ledgers, ledger, suspects, new)
+        alone = [_as_suspect(ledger.closures[row], IMPROBABLE) for row in settled.tolist()]
+        if not looked_at.size:
+            return verdicts_of(alone) if alone else None
         chosen = self._chosen(solver, ledger, looked_at)
+        ledger.bound[looked_at] = np.linalg.inv(chosen.allowed)
         rows = _rows(ledger, looked_at, chosen)
         if chosen.rivals and not any(reason in _BELIEVED for reason in chosen.reasons):
             tried = self._try_rivals(solver, ledger, looked_at[chosen.rivals])
             again = {row[0].factor_id for row in tried}
             rows = [row for row in rows if row[0].factor_id not in again] + tried
-        return verdicts_of(rows)
+        return verdicts_of(rows + alone)
 
     def look_back(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
         """The worst of those accepted, where it is improbable; None: none is.  Raises SolverError."""
@@ -73,40 +90,73 @@ class ClosureJudge:
             tested = tested[(ledgers.looks * most + np.arange(most)) % tested.size]
         if not tested.size:
             return None
-        now = closure_numbers(solver, ledger, tested, False)
-        r = tangent_of(inverse_motion(now.z) @ inverse_motion(now.a) @ now.b)
-        own = np.einsum("na,nab,nb->n", r, ledger.weight[tested], r)
-        worst = tested[np.argsort(-own, kind="stable")[:_WORST]]
-        if float(own.max()) <= _EXPECTED * ledger.dim:
+        out = self.limits[ledger.dim].out
+        most_likely = residuals_weighed(solver, ledger, tested)
+        worst = np.flatnonzero(~(most_likely <= out))
+        if not worst.size:
             return None
-        d2 = judge_accepted(closure_numbers(solver, ledger, worst))
+        order = np.argsort(-np.nan_to_num(most_likely[worst], nan=np.inf), kind="stable")
+        worst = tested[worst[order[:_WORST]]]
+        numbers = closure_numbers(solver, ledger, worst)
+        ledger.bound[worst] = weights_without(numbers)
+        d2 = residuals_weighed(solver, ledger, worst)
         found = ledger.closures[int(worst[int(d2.argmax())])]
-        if float(d2.max()) <= float(threshold(np.array([ledger.dim]), self.policy.closure_out_probability)[0]):
+        if float(d2.max()) <= out:
             return None
         return verdicts_of([(found, SUSPECT, CONTRADICTED, float(d2.max()), found.chance, found.tried)])
 
     def _chosen(self, solver: Solver, ledger: Ledger, rows: I64) -> Chosen:
-        count = len(ledger.closures)
-        every = closure_numbers(solver, ledger, np.arange(count), False)
-        places = np.concatenate([every.a[:, :2, -1], every.b[:, :2, -1]])
-        extent = float(np.ptp(places, axis=0).max()) / 2.0
-        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy)
+        """Among rows; mistakes may lead to wherever the map has poses."""
+        graph = solver._graph
+        var = graph.var[: graph.counts[at.VARIABLES]]
+        starts = var[var[:, at.V_KIND] == (at.SE2 if ledger.dim == _PLANE_DIM else at.SE3), at.V_AT]
+        extent = float(np.ptp(graph.values[starts[:, None] + np.arange(2)], axis=0).max()) / 2.0
+        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds())
 
-    def _revisited(self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger, suspects: I64) -> I64:
-        """Suspects to look at again: of the newest that are unsure those of many places, the newest that are not, and,
-        if the map has got or lost closures since, those that were not looked at for longest."""
-        most, among = self.policy.closure_revisits, suspects[-4 * _NEWEST :]
-        is_unsure = np.array([ledger.closures[row].reason == UNSURE for row in among.tolist()], bool)
-        unsure = among[is_unsure][-_NEWEST:][::-1]
-        if unsure.size:
-            places = closure_places(closure_numbers(solver, ledger, unsure, False), self.policy.closure_place_m)
-            before = [int((places[:k] == places[k]).sum()) for k in range(unsure.size)]  # newer ones of the same place
-            unsure = unsure[np.argsort(before, kind="stable")][: most // 2]
-        picked = np.concatenate([unsure, among[~is_unsure][::-1][: most // 4]])
-        left = np.setdiff1d(suspects, picked)
-        left = left[ledger.looked[left] < ledgers.moved_at]
-        longest = left[np.argsort(ledger.looked[left], kind="stable")]
-        return np.concatenate([picked, longest[: most - picked.size]])
+    def _revisited(
+        self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger, suspects: I64, new: I64
+    ) -> tuple[I64, I64]:
+        """What to look at, and new ones that are improbable as nothing agrees with them.
+
+        With new ones go, of the newest suspects that are unsure those of many places, and of those that are not, what
+        agrees with a new one; and what may be believed now that the map has moved, first what was not looked at for
+        longest.
+        """
+        most, out, settled, picked = self.policy.closure_revisits, self.limits[ledger.dim].out, new[:0], new
+        if new.size:
+            among = np.setdiff1d(suspects[-4 * _NEWEST :], new, assume_unique=True)
+            is_improbable = ledger.is_improbable[among]
+            companions = self._companions(solver, ledger, new, np.ascontiguousarray(among[is_improbable][::-1]))
+            if not companions.size:
+                is_settled = np.array([ledger.closures[row].distance > out for row in new.tolist()])
+                settled, picked = new[is_settled], new[~is_settled]
+            if picked.size:
+                unsure = among[~is_improbable][-_NEWEST:][::-1]
+                picked = np.concatenate([picked, self._of_many_places(solver, ledger, unsure), companions[: most // 2]])
+        left = suspects[ledger.looked[suspects] < ledgers.moved_at]
+        if left.size and (left := np.setdiff1d(left, np.union1d(picked, new), assume_unique=True)).size:
+            left = left[~(residuals_weighed(solver, ledger, left) > out)]
+            longest = left[np.argsort(ledger.looked[left], kind="stable")]
+            picked = np.concatenate([picked, longest[: max(most + new.size - picked.size, 0)]])
+        return np.sort(picked), settled
+
+    def _of_many_places(self, solver: Solver, ledger: Ledger, unsure: I64) -> I64:
+        """Half as many as may be looked at again, those first of whose place few have come before."""
+        most = self.policy.closure_revisits // 2
+        if unsure.size <= most:
+            return unsure
+        places = closure_places(closure_numbers(solver, ledger, unsure, False), self.policy.closure_place_m)
+        before = [int((places[:k] == places[k]).sum()) for k in range(unsure.size)]
+        return unsure[np.argsort(before, kind="stable")][:most]
+
+    def _companions(self, solver: Solver, ledger: Ledger, new: I64, others: I64) -> I64:
+        """Of `others`, in their order, those whose loop with a new one comes back within the policy's spread."""
+        if not others.size or ledger.dim != _PLANE_DIM:
+            return others
+        found, spread = np.empty(others.size, np.int64), self.limits[ledger.dim].spread
+        table = solver._graph.array_table
+        count = list_companions(new, others, ledger.ends, ledger.z, table, spread.metres, spread.radians, found)
+        return found[:count]
 
     def _try_rivals(self, solver: Solver, ledger: Ledger, rivals: I64) -> list[_Row]:
         """Without the closures of one place: where more places' rivals are believed then, those go in instead."""
@@ -135,19 +185,40 @@ class ClosureJudge:
         )
 
 
+def _as_suspect(c: Closure, reason: str) -> _Row:
+    return c, SUSPECT, reason, c.distance, c.chance, c.tried
+
+
+def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:
+    """rᵀ W r (n,) of some closures, W their bounds."""
+    if ledger.dim == _PLANE_DIM:
+        out = np.empty(rows.size)
+        weigh_residuals(rows, ledger.ends, ledger.z, ledger.bound, solver._graph.array_table, out)
+        return out
+    now = closure_numbers(solver, ledger, rows, False)
+    r = tangent_of(inverse_motion(now.z) @ inverse_motion(now.a) @ now.b)
+    return np.einsum("na,nab,nb->n", r, ledger.bound[rows], r)
+
+
 def closure_numbers(solver: Solver, ledger: Ledger, rows: I64, with_covariance: bool = True) -> ClosureNumbers:
     """Of some closures, with the poses they are between as the solver has them."""
     ends, graph = ledger.ends[rows], solver._graph
-    different, where = np.unique(ends, return_inverse=True)
-    where = where.reshape(ends.shape)
-    T = motions_of_poses(graph.values[graph.var[different, at.V_AT, None] + np.arange(ledger.size)])
+    listed = ends.reshape(-1).tolist()
+    place = {v: k for k, v in enumerate(dict.fromkeys(listed))}
+    different, where = np.array(list(place)), np.array([place[v] for v in listed])
+    T = motions_of_poses(graph.values[graph.var[different, at.V_AT, None] + np.arange(ledger.size)])[where]
     known = np.empty((0, 0))
     if with_covariance:
         source, d = solver.covariances, ledger.dim
-        joint = CovarianceBlocks(source.try_view() or source.factored()).joint(different)
-        scalars = (where.reshape(-1, 1) * d + np.arange(d)).reshape(-1)
-        known = joint[np.ix_(scalars, scalars)]
-    return ClosureNumbers(T[where[:, 0]], T[where[:, 1]], ledger.z[rows], ledger.noise[rows], known)
+        is_free = bool((graph.var[different, at.V_SCALAR] >= 0).all())
+        known = source.try_joint(different) if is_free else None
+        if known is None:
+            known = CovarianceBlocks(source.try_view() or source.factored()).joint(different)
+        if different.size < where.size:
+            scalars = (where[:, None] * d + np.arange(d)).reshape(-1)
+            known = known[scalars[:, None], scalars]
+    a, b = np.ascontiguousarray(T[0::2]), np.ascontiguousarray(T[1::2])
+    return ClosureNumbers(a, b, ledger.z[rows], ledger.noise[rows], known)
 
 
 def _rows(ledger: Ledger, rows: I64, chosen: Chosen) -> list[_Row]:

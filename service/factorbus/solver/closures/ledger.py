@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from factorbus.solver.closures.choosing import IMPROBABLE
 from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.factor_graph import FactorGraph, with_room
@@ -21,16 +22,16 @@ CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 _BELIEVED = {ACCEPTED, RESTORED}
-_COLUMNS = ("z", "noise", "weight", "ends", "looked", "is_suspect", "is_tested")
+_COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_tested", "is_improbable")
 
 
 @dataclass(slots=True, eq=False)
 class Closure:
     """One closure.
 
-    factor_id: its id, whether it is in or not; row: in its ledger.  came, changed: revisions, when it came, and when its
-    state last changed.  reason: why its state is what it is.  distance: d², chance: of a false one to be within the gate,
-    both when it was last looked at.  tried: the newest rival when it was last taken out on trial.
+    factor_id: its id, whether it is in or not; row: in its ledger.  came, changed: revisions, when it came, and when
+    its state last changed.  reason: why its state is what it is.  distance: d², chance: the odds of its residual, both
+    when it was last looked at.  tried: the newest rival when it was last taken out on trial.
     """
 
     factor_id: int
@@ -93,39 +94,72 @@ class ClosureVerdicts(NamedTuple):
 class Ledger:
     """Closures of one kind.
 
-    z (n, k, k), noise, weight (n, d, d): what was measured, Ω⁻¹ and Ω in its tangent space, metres and radians.
-    ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out.
-    looked (n,): when it was last looked at, in looks.  All have room behind for more.
+    z (n, k, k), noise (n, d, d): what was measured, and Ω⁻¹ in its tangent space, metres and radians.
+    bound (n, d, d): rᵀ W r is no less than d² of one that is in, and no more than that of a suspect, for as long as the
+    map only gets factors, to first order; NaN: not known.  Nothing but work depends on it.
+    ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out;
+    is_improbable (n,): a suspect for that reason.  looked (n,): when it was last looked at, in looks.
+    All have room behind for more.
     """
 
     def __init__(self, kind: str) -> None:
         self.kind, self.size, self.dim = kind, POSES_BETWEEN[kind], 3 if kind == "between_se2" else 6
         self.closures: list[Closure] = []
         k, d = 3 if self.dim == 3 else 4, self.dim
-        self.z, self.noise, self.weight = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
+        self.z, self.noise, self.bound = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
         self.ends, self.looked = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
-        self.is_suspect, self.is_tested = np.zeros(0, bool), np.zeros(0, bool)
+        self.is_suspect, self.is_tested, self.is_improbable = (np.zeros(0, bool) for _ in range(3))
 
     def add(self, closure: Closure, ends: Sequence[int], looked: int) -> None:
         """One more."""
         n = closure.row = len(self.closures)
-        if n == len(self.z):
-            for name in _COLUMNS:
-                setattr(self, name, with_room(getattr(self, name), n + 1))
+        self._make_room(n + 1)
         self.closures.append(closure)
         self.ends[n], self.looked[n] = ends, looked
-        self.measure(closure, closure.factor)
         self.mark(closure)
+        self.measure(closure, closure.factor)
+
+    def enter(self, new: Sequence[Closure], ends: I64, looked: int, z: F64, noise: F64, bound: F64) -> None:
+        """Several more, of which these columns are known."""
+        n, count = len(self.closures), len(self.closures) + len(new)
+        self._make_room(count)
+        self.ends[n:count], self.looked[n:count] = ends, looked
+        self.z[n:count], self.noise[n:count], self.bound[n:count] = z, noise, bound
+        for row, closure in enumerate(new, n):
+            closure.row = row
+            self.is_suspect[row], self.is_tested[row] = closure.state == SUSPECT, closure.state == ACCEPTED
+        self.closures += new
+
+    def _make_room(self, need: int) -> None:
+        if need > len(self.z):
+            for name in _COLUMNS:
+                setattr(self, name, with_room(getattr(self, name), need))
 
     def measure(self, closure: Closure, factor: FactorGroup) -> None:
         """What it measures, and how well."""
         closure.factor = factor
         self.z[closure.row] = motions_of_poses(factor.measured)[0]
-        self.noise[closure.row], self.weight[closure.row] = _certainty(factor, self.dim)
+        self.noise[closure.row], self.bound[closure.row] = _noise(factor, self.dim), np.nan
 
     def mark(self, closure: Closure) -> None:
         """Its state has changed."""
-        self.is_suspect[closure.row], self.is_tested[closure.row] = closure.state == SUSPECT, closure.state == ACCEPTED
+        row, is_suspect = closure.row, closure.state == SUSPECT
+        if self.is_suspect[row] and not is_suspect:  # Ω S Ω, of S when it was a suspect
+            weight = np.linalg.inv(self.noise[row])
+            self.bound[row] = weight @ np.linalg.inv(self.bound[row]) @ weight
+        elif self.is_suspect[row] != is_suspect:
+            self.bound[row] = np.nan
+        self.is_suspect[row], self.is_tested[row] = is_suspect, closure.state == ACCEPTED
+        self.is_improbable[row] = is_suspect and closure.reason == IMPROBABLE
+
+    def odds(self) -> float:
+        """Of a closure to be false, by those that have come (Laplace's rule), and even at most.
+
+        Improbable ones count as false, those that are in as right.
+        """
+        n = len(self.closures)
+        false, right = np.count_nonzero(self.is_improbable[:n]), np.count_nonzero(self.is_tested[:n])
+        return min((1 + false) / (1 + right), 1.0)
 
     def suspects(self) -> I64:
         """Rows."""
@@ -135,9 +169,9 @@ class Ledger:
         """Rows."""
         return np.flatnonzero(self.is_tested[: len(self.closures)])
 
-    def unjudged(self) -> I64:
-        """Rows of those that nobody has looked at."""
-        return np.array([row for row in self.suspects().tolist() if self.closures[row].reason == NEW], np.int64)
+    def unjudged(self, suspects: I64) -> I64:
+        """Of these rows those that nobody has looked at."""
+        return suspects[[self.closures[row].reason == NEW for row in suspects.tolist()]]
 
 
 class ClosureLedger:
@@ -168,6 +202,11 @@ class ClosureLedger:
         self.of_factor[factor_id] = closure
         return closure
 
+    def enter(self, kind: str, new: Sequence[Closure], ends: I64, z: F64, noise: F64, bound: F64) -> None:
+        """New ones of a kind, with their columns."""
+        self.of_kind[kind].enter(new, ends, self.looks, z, noise, bound)
+        self.of_factor |= {closure.factor_id: closure for closure in new}
+
     def named(self, factors: Iterable[int]) -> list[Closure]:
         """Those with these ids.  Raises NotAClosure."""
         found = []
@@ -195,7 +234,7 @@ class ClosureLedger:
     def note(self, verdicts: ClosureVerdicts, revision: int) -> list[Closure]:
         """They are so from now on; gives those whose state is another than before.  Raises NotAClosure."""
         self.looks += 1
-        changed, moved = [], False
+        changed, moved, lost = [], False, False
         for k, c in enumerate(self.named(verdicts.factors.tolist())):
             was, ledger = (c.state, c.is_in), self.of_kind[c.factor.kind]
             c.state, c.reason, c.tried = verdicts.states[k], verdicts.reasons[k], int(verdicts.tried[k])
@@ -205,9 +244,11 @@ class ClosureLedger:
             if c.state != was[0]:
                 c.changed = revision
                 changed.append(c)
-            moved = moved or c.is_in != was[1]
+            moved, lost = moved or c.is_in != was[1], lost or (was[1] and not c.is_in)
         if moved:
             self.moved_at = self.looks
+        for ledger in self.of_kind.values() if lost else ():
+            ledger.bound[:] = np.nan
         return changed
 
     def forget(self, gone: Iterable[int], graph: FactorGraph) -> None:
@@ -273,6 +314,14 @@ def verdicts_of(rows: Iterable[tuple[Closure, str, str, float, float, int]]) -> 
     )
 
 
+def pick_row(group: FactorsLike, k: int) -> FactorGroup:
+    """One factor of a group."""
+    own = slice(k, k + 1)
+    scale = None if group.scale is None else group.scale[own].copy()
+    picked = group.keys[own].copy(), group.measured[own].copy(), group.information[own].copy()
+    return FactorGroup(group.kind, *picked, group.loss, scale)
+
+
 def pick_rows(group: FactorsLike, chosen: np.ndarray | I64) -> FactorGroup:
     """Some factors of a group."""
     scale = None if group.scale is None else group.scale[chosen]
@@ -280,12 +329,12 @@ def pick_rows(group: FactorsLike, chosen: np.ndarray | I64) -> FactorGroup:
     return FactorGroup(group.kind, *picked, group.loss, scale)
 
 
-def _certainty(factor: FactorGroup, d: int) -> tuple[F64, F64]:
-    """Ω⁻¹ and Ω in metres and radians: the residual of a rotation in space is half its angle."""
+def _noise(factor: FactorGroup, d: int) -> F64:
+    """Ω⁻¹ in metres and radians: the residual of a rotation in space is half its angle."""
     omega = np.zeros((d, d))
     rows, columns = np.triu_indices(d)
     omega[rows, columns] = omega[columns, rows] = factor.information[0]
     if d == 6:
         halves = np.array([1.0] * 3 + [0.5] * 3)
         omega *= halves[:, None] * halves
-    return np.asarray(np.linalg.inv(omega), np.float64), omega
+    return np.asarray(np.linalg.inv(omega), np.float64)

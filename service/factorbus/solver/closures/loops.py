@@ -4,12 +4,12 @@ Relative poses between keys that follow each other, x6 and x7, are odometry, and
 client says are.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from factorbus.solver.closures.ledger import POSES_BETWEEN, pick_rows
+from factorbus.solver.closures.ledger import POSES_BETWEEN, pick_row, pick_rows
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import arities_of, is_first
 from factorbus.solver.graph.groups import BatchLike, FactorGroup, FactorsLike
@@ -17,18 +17,39 @@ from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 
 _GROUND = object()
+_NOWHERE: I64 = np.empty(0, np.int64)
 
 
 class SplitFactors(NamedTuple):
-    """The factors of a batch that are trusted, in their order, and those that close loops, one each.
+    """The factors of a batch, how many there are, and those of them that close loops, one each.
 
-    trusted_at, closing_at: their places among all factors of the batch.
+    closing_at: their places among all factors of the batch, ascending.
     """
 
-    trusted: list[FactorsLike]
-    trusted_at: I64
+    factors: Sequence[FactorsLike]
+    count: int
     closing: list[FactorGroup]
     closing_at: I64
+
+    @property
+    def trusted_at(self) -> I64:
+        """The places of those that are trusted."""
+        return np.delete(np.arange(self.count), self.closing_at)
+
+    @property
+    def trusted(self) -> list[FactorsLike]:
+        """Those that are trusted, in their order."""
+        if not self.closing:
+            return list(self.factors)
+        trusted, before = list[FactorsLike](), 0
+        is_trusted = np.ones(self.count, bool)
+        is_trusted[self.closing_at] = False
+        for group in self.factors:
+            own = is_trusted[before : before + len(group.keys)]
+            if own.any():
+                trusted.append(group if own.all() else pick_rows(group, own))
+            before += len(group.keys)
+        return trusted
 
 
 def has_candidates(batch: BatchLike) -> bool:
@@ -47,28 +68,29 @@ class TrustedForest:
     def split(self, batch: BatchLike) -> SplitFactors:
         """Join what trusted factors of a batch join; gives them, and those that close loops."""
         self._begin(batch)
-        are_trusted = [_are_trusted(group) for group in batch.factors]
-        for group, trusted in zip(batch.factors, are_trusted, strict=True):
-            self._join_rows(group.keys[trusted])
-        made, before = SplitFactors([], np.empty(0, np.int64), [], np.empty(0, np.int64)), 0
-        at_trusted, at_closing = list[int](), list[int]()
-        for group, trusted in zip(batch.factors, are_trusted, strict=True):
-            for k in np.flatnonzero(~trusted).tolist():
-                i, j = group.keys[k].tolist()
-                trusted[k] = self._join(i, j)
-            made.closing.extend(pick_rows(group, np.array([k])) for k in np.flatnonzero(~trusted).tolist())
-            if trusted.any():
-                made.trusted.append(group if trusted.all() else pick_rows(group, trusted))
-            at_trusted += (before + np.flatnonzero(trusted)).tolist()
-            at_closing += (before + np.flatnonzero(~trusted)).tolist()
-            before += len(group.keys)
-        return made._replace(trusted_at=np.array(at_trusted, np.int64), closing_at=np.array(at_closing, np.int64))
+        waiting, count = list[tuple[FactorsLike, int, int, int, int]](), 0
+        for group in batch.factors:
+            rows = group.keys.tolist()
+            if group.kind in POSES_BETWEEN and not getattr(group, "trusted", False):
+                for k, (i, j) in enumerate(rows):
+                    if -1 <= i - j <= 1 and i != j:
+                        self._join(i, j)
+                    else:
+                        waiting.append((group, k, count + k, i, j))
+            else:
+                self._join_rows(rows)
+            count += len(rows)
+        closing = [one for one in waiting if not self._join(one[3], one[4])]
+        if not closing:
+            return SplitFactors(batch.factors, count, [], _NOWHERE)
+        closing_at = np.array([one[2] for one in closing])
+        return SplitFactors(batch.factors, count, [pick_row(one[0], one[1]) for one in closing], closing_at)
 
     def join(self, batch: BatchLike) -> None:
         """Join what all factors of a batch join."""
         self._begin(batch)
         for group in batch.factors:
-            self._join_rows(group.keys)
+            self._join_rows(group.keys.tolist())
 
     def forget(self) -> None:
         """As before the last batch, which was refused."""
@@ -118,8 +140,8 @@ class TrustedForest:
                 for key in group.keys.tolist():
                     self._join(_GROUND, key)
 
-    def _join_rows(self, keys: I64) -> None:
-        for row in keys.tolist():
+    def _join_rows(self, rows: Sequence[Sequence[int]]) -> None:
+        for row in rows:
             for key in row[1:]:
                 self._join(row[0], key)
 
