@@ -28,9 +28,9 @@ _COLUMNS = ("z", "noise", "weight", "ends", "looked", "is_suspect", "is_tested")
 class Closure:
     """One closure.
 
-    factor_id: its id, whether it is in or not; row: in its ledger.  came, changed: revisions, when it came, and when its
-    state last changed.  reason: why its state is what it is.  distance: d², chance: of a false one to be within the gate,
-    both when it was last looked at.  tried: the newest rival when it was last taken out on trial.
+    factor_id: its id, whether it is in or not; row: in its ledger.  came, changed: revisions, when it came, and when
+    its state last changed.  reason: why its state is what it is.  distance: d², chance: of a false one to be within the
+    gate, both when it was last looked at.  tried: the newest rival when it was last taken out on trial.
     """
 
     factor_id: int
