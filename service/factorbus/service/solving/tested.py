@@ -263,7 +263,7 @@ class TestedMapSolver(MapSolver):
             insert._replace(content=Insert(insert.sequence, batch, changes=changes)), verdicts, switch, set()
         )
         with self._without_limits():
-            return (yield from self._make(insert, asked, 0))
+            return (yield from self._carry_out(insert, asked, 0))
 
     @contextmanager
     def _without_limits(self) -> Iterator[None]:
@@ -274,7 +274,7 @@ class TestedMapSolver(MapSolver):
         finally:
             self._limits = limits
 
-    def _make(self, insert: Arrived, asked: _Asked, added: int) -> Generator[Verdict | Stepped, None, bool]:
+    def _carry_out(self, insert: Arrived, asked: _Asked, added: int) -> Generator[Verdict | Stepped, None, bool]:
         """Make what is asked for, and note it; gives whether it was accepted.
 
         added: factors beside those that come.
@@ -301,7 +301,7 @@ class TestedMapSolver(MapSolver):
         except SolverError as problem:
             yield Verdict((refusal(insert, problem),))
             return
-        if not (yield from self._make(insert, asked, content.batch.factor_count)):
+        if not (yield from self._carry_out(insert, asked, content.batch.factor_count)):
             return
         graph, names = self._solver.factor_graph, {change.change for change in content.changes}
         if names & _CUTTING or asked.gone:
