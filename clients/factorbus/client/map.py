@@ -25,11 +25,12 @@ from factorbus.client.pending_insert import PendingInsert
 from factorbus.client.questions import Questions, logged
 from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.request_sender import Request, RequestSender
-from factorbus.client.supported import check_changes, check_interest, check_stamps
+from factorbus.client.supported import check_changes, check_interest, check_stamps, check_suspects, check_trusted
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
+from factorbus.proto.closures import Suspects
 from factorbus.proto.interest import Interest
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Insert, MapGraph
@@ -174,6 +175,7 @@ class Map:
         batch, settle = batch_of("batch", batch), checked_flag("settle", settle)
         listed = () if changes is None else of_type("changes", changes, Changes, "a Changes").listed()
         check_stamps(self._protocol, batch)
+        check_trusted(self._protocol, batch)
         timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
@@ -261,6 +263,14 @@ class Map:
         Raises Refused, Unavailable.
         """
         return self.ask.repair(factors, probability, timeout_s).result()
+
+    def suspects(self, every: bool = False, timeout_s: float | None = None) -> Suspects:
+        """Loop closures that the estimate does not have, or `every` one: of a map that tests them.
+
+        Raises Refused, Unavailable, NotSupported.
+        """
+        check_suspects(self._protocol)
+        return self.ask.suspects(every, timeout_s).result()
 
     def graph(self, timeout_s: float | None = None) -> MapGraph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""

@@ -76,7 +76,7 @@ def note_switch(
     following: int,
     revision: int,
 ) -> list[Closure]:
-    """The step is made that `switch` asks for, what came has the last rows; gives closures whose state is another.
+    """The step is made that `switch` asks for; what came has the last rows.  Gives closures whose state is another.
 
     following: the id that the next factor gets.
     """
