@@ -32,9 +32,10 @@ _MOST_BRANCHES = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What each of n closures is: one of the reasons above; d², and the odds of its residual by the policy's spread.
+    """What each of n closures is: one of the reasons above; d²; and the odds that it is false, even ones before: of its
+    residual, or of the set that is believed.
 
-    rivals: those outside the gate that agree with each other, at two places or more: the map may be wrong.
+    rivals: those outside the gate that agree with each other: the map may be wrong.
     allowed (n, d, d): S of each.
     """
 
@@ -54,9 +55,11 @@ def choose_closures(c: ClosureNumbers, extent_m: float, policy: ClosurePolicy, o
     sure = within & (odds * each.chance[:, 0] <= policy.closure_chance_max)
     reasons = [PASSED if s else UNSURE if w else IMPROBABLE for s, w in zip(sure, within, strict=True)]
     sets = _Sets(c, gate, spreads, policy)
-    for k in sets.believed(np.flatnonzero(~sure & (each.distance <= out)), odds * each.chance[:, 1]):
-        reasons[k] = AGREES
-    return Chosen(reasons, each.distance, each.chance[:, 0], sets.rivals(np.flatnonzero(~within)), each.allowed)
+    members, of_set = sets.believed(np.flatnonzero(~sure & (each.distance <= out)), odds * each.chance[:, 1])
+    chance = each.chance[:, 0].copy()
+    for k in members:
+        reasons[k], chance[k] = AGREES, min(of_set, chance[k])
+    return Chosen(reasons, each.distance, chance, sets.rivals(np.flatnonzero(~within)), each.allowed)
 
 
 class ClosureLimits(NamedTuple):
@@ -90,8 +93,8 @@ class _Sets:
         self.chance[i, j] = self.chance[j, i] = pairs.chance
         self.places, self.policy = closure_places(c, policy.closure_place_m), policy
 
-    def believed(self, among: I64, alone: F64) -> list[int]:
-        """The largest one among some, or none where it may be chance; alone (n,): the odds of each, anywhere.
+    def believed(self, among: I64, alone: F64) -> tuple[list[int], float]:
+        """The largest one among some, or none where it may be chance, and its odds; alone (n,): of each, anywhere.
 
         Of each member one other says so well where it is that a false one would hardly agree.
         """
@@ -102,7 +105,7 @@ class _Sets:
                 break
             members = members[sure]
         if members.size < 2:
-            return []
+            return [], 1.0
         chance, own = self.chance[np.ix_(members, members)], self.places[members]
         there = np.unique(own)
         # Of two places the two that are the least likely to agree.
@@ -110,12 +113,12 @@ class _Sets:
         logarithm = _chain(between) + math.log(max(float(alone[members].min()), _LEAST_CHANCE))
         by_mistake = _expected(np.unique(self.places[among]).size, there.size, logarithm)
         is_sure = self._is_set(members, among.size) and by_mistake <= self.policy.closure_chance_max
-        return members.tolist() if is_sure else []
+        return (members.tolist(), by_mistake) if is_sure else ([], 1.0)
 
     def rivals(self, among: I64) -> list[int]:
-        """The largest one among some, of two places or more, that is not by chance of independent ones."""
+        """The largest one among some, three or more, that is not by chance of independent ones."""
         members = self._largest(among)
-        if members.size < 3 or np.unique(self.places[members]).size < 2:
+        if members.size < 3:
             return []
         return members.tolist() if self._is_set(members, among.size) else []
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factorbus.solver.closures.motions import adjoint_motion, inverse_motion, tangent_of
+from factorbus.solver.closures.motions import adjoint_motion, inverse_motion, motions_of_poses, tangent_of
 from factorbus.solver.kernels.closures.plane import (
     FULL,
     HELD,
@@ -35,6 +35,7 @@ from factorbus.solver.kernels.closures.plane import (
 from factorbus.solver.kernels.jit.compile import F64, I64
 
 _PLANE = 3
+_ALONE = 1e-6  # of Ω⁻¹
 
 
 class ClosureNumbers(NamedTuple):
@@ -103,18 +104,22 @@ def judge_accepted(c: ClosureNumbers) -> F64:
 
     That is of first order; where the closure alone holds what it measures nothing speaks against it: 0.
     """
-    M, r = weights_without(c), _residuals(c)[1]
+    M, r = exact_weights_without(c), _residuals(c)[1]
     return np.einsum("na,nab,nb->n", r, M, r)
 
 
 def weights_without(c: ClosureNumbers) -> F64:
-    """(Ω⁻¹ − J Σ Jᵀ)⁻¹ (n, d, d) of closures that the map has; 0 along what the closure alone holds."""
+    """(Ω⁻¹ − J Σ Jᵀ)⁻¹ (n, d, d) of closures that the map has; axes that one alone holds are left out."""
+    if c.noise.shape[1] != _PLANE:
+        return exact_weights_without(c)
+    out = np.empty(c.noise.shape)
+    weights_without_plane(*map(np.ascontiguousarray, (c.a, c.b, c.noise, c.known)), out)
+    return out
+
+
+def exact_weights_without(c: ClosureNumbers) -> F64:
+    """The same; 0 along any direction that the closure alone holds."""
     d = c.noise.shape[1]
-    if d == _PLANE:
-        out = np.empty(c.noise.shape)
-        weights_without_plane(*map(np.ascontiguousarray, (c.a, c.b, c.noise, c.known)), out)
-        if not np.isnan(out).any():
-            return out
     J = _jacobians(_residuals(c)[0])
     half = np.linalg.cholesky(c.noise)
     back = np.linalg.inv(half)
@@ -123,6 +128,34 @@ def weights_without(c: ClosureNumbers) -> F64:
     white = Q.swapaxes(1, 2) @ back
     share = np.where(left > HELD, 1.0 / np.maximum(left, HELD), 0.0)
     return np.asarray(white.swapaxes(1, 2) @ (share[..., None] * white), np.float64)
+
+
+def numbers_without(c: ClosureNumbers, gone: int) -> ClosureNumbers:
+    """Closures `gone` and later, as the map has them without the first ones, to first order: δ = G M r, Σ + G M Gᵀ.
+
+    With H the Jacobians of all that go, G = Σ Hᵀ, M = (Ω⁻¹ − H G)⁻¹.  A millionth of Ω holds what they alone hold.
+    """
+    n, d = c.noise.shape[:2]
+    there, r = _residuals(c)
+    H = np.zeros((gone, d, n, 2 * d))
+    H[np.arange(gone), :, np.arange(gone)] = _jacobians(there)[:gone]
+    H = H.reshape(gone * d, -1)
+    left = np.zeros((gone, d, gone, d))
+    left[np.arange(gone), :, np.arange(gone)] = (1.0 + _ALONE) * c.noise[:gone]
+    G = c.known @ H.T
+    gain = np.linalg.solve(left.reshape(gone * d, -1) - H @ G, G.T).T
+    moved = (gain @ r[:gone].reshape(-1)).reshape(n, 2, d)[gone:]
+    a, b = (_moved(T[gone:], moved[:, end]) for end, T in enumerate((c.a, c.b)))
+    first = 2 * d * gone
+    return ClosureNumbers(a, b, c.z[gone:], c.noise[gone:], (c.known + gain @ G.T)[first:, first:])
+
+
+def odds_without(c: ClosureNumbers, spread: FalseSpread) -> F64:
+    """p (n,) of closures in the plane that the map has, each against the map without it: S = Ω⁻¹ W Ω⁻¹."""
+    W, r = weights_without(c), _residuals(c)[1]
+    root = np.sqrt(np.maximum(np.linalg.det(W), 0.0)) * np.linalg.det(c.noise)
+    distance = np.einsum("na,nab,nb->n", r, W, r)
+    return _odds(FULL * root * np.exp(0.5 * np.minimum(distance, MOST_DISTANCE)), [spread])[:, 0]
 
 
 def volume_of(spread: FalseSpread) -> float:
@@ -158,6 +191,23 @@ def _jacobians(there: F64) -> F64:
     """J of each."""
     back = adjoint_motion(inverse_motion(there))
     return np.concatenate([-back, np.broadcast_to(np.eye(back.shape[-1]), back.shape)], axis=-1)
+
+
+def _moved(T: F64, x: F64) -> F64:
+    """T exp(x) with the translation as it stands, for turns that are small."""
+    size = T.shape[-1] - 1
+    step = np.zeros(T.shape)
+    step[:, np.arange(size + 1), np.arange(size + 1)] = 1.0
+    step[:, :size, size] = x[:, :size]
+    if size == 2:
+        c, s = np.cos(x[:, 2]), np.sin(x[:, 2])
+        step[:, 0, 0], step[:, 0, 1], step[:, 1, 0], step[:, 1, 1] = c, -s, s, c
+        return T @ step
+    half = 0.5 * x[:, 3:]
+    q = np.concatenate([half, np.ones((len(x), 1))], axis=1)
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    step[:, :3, :3] = motions_of_poses(np.concatenate([x[:, :3], q], axis=1))[:, :3, :3]
+    return T @ step
 
 
 def _own_blocks(c: ClosureNumbers) -> F64:

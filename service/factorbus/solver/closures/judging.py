@@ -25,7 +25,13 @@ from factorbus.solver.closures.choosing import (
     closure_places,
     limits_of,
 )
-from factorbus.solver.closures.evidence import ClosureNumbers, weights_without
+from factorbus.solver.closures.evidence import (
+    ClosureNumbers,
+    exact_weights_without,
+    numbers_without,
+    odds_without,
+    weights_without,
+)
 from factorbus.solver.closures.ledger import (
     ACCEPTED,
     SUSPECT,
@@ -76,7 +82,7 @@ class ClosureJudge:
         chosen = self._chosen(solver, ledger, looked_at)
         ledger.bound[looked_at] = np.linalg.inv(chosen.allowed)
         rows = _rows(ledger, looked_at, chosen)
-        if chosen.rivals and not any(reason in _BELIEVED for reason in chosen.reasons):
+        if chosen.rivals and not _believes(chosen):
             tried = self._try_rivals(solver, ledger, looked_at[chosen.rivals])
             again = {row[0].factor_id for row in tried}
             rows = [row for row in rows if row[0].factor_id not in again] + tried
@@ -100,18 +106,26 @@ class ClosureJudge:
         numbers = closure_numbers(solver, ledger, worst)
         ledger.bound[worst] = weights_without(numbers)
         d2 = residuals_weighed(solver, ledger, worst)
-        found = ledger.closures[int(worst[int(d2.argmax())])]
         if float(d2.max()) <= out:
             return None
-        return verdicts_of([(found, SUSPECT, CONTRADICTED, float(d2.max()), found.chance, found.tried)])
+        row = worst[[int(d2.argmax())]]
+        ledger.bound[row] = exact_weights_without(closure_numbers(solver, ledger, row))
+        if (distance := residuals_weighed(solver, ledger, row).item()) <= out:
+            return None
+        found = ledger.closures[row.item()]
+        return verdicts_of([(found, SUSPECT, CONTRADICTED, distance, found.chance, found.tried)])
 
     def _chosen(self, solver: Solver, ledger: Ledger, rows: I64) -> Chosen:
-        """Among rows; mistakes may lead to wherever the map has poses."""
+        """Among rows."""
+        extent = self._extent(solver, ledger)
+        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds())
+
+    def _extent(self, solver: Solver, ledger: Ledger) -> float:
+        """Half the length of the map: mistakes may lead to wherever it has poses."""
         graph = solver._graph
         var = graph.var[: graph.counts[at.VARIABLES]]
         starts = var[var[:, at.V_KIND] == (at.SE2 if ledger.dim == _PLANE_DIM else at.SE3), at.V_AT]
-        extent = float(np.ptp(graph.values[starts[:, None] + np.arange(2)], axis=0).max()) / 2.0
-        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds())
+        return float(np.ptp(graph.values[starts[:, None] + np.arange(2)], axis=0).max()) / 2.0
 
     def _revisited(
         self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger, suspects: I64, new: I64
@@ -159,18 +173,26 @@ class ClosureJudge:
         return found[:count]
 
     def _try_rivals(self, solver: Solver, ledger: Ledger, rivals: I64) -> list[_Row]:
-        """Without the closures of one place: where more places' rivals are believed then, those go in instead."""
-        tested = ledger.tested()[-_NEWEST:]
-        ids = np.array([ledger.closures[row].factor_id for row in rivals.tolist()])
-        newest = int(np.sort(ids)[-_RETRY])
-        tested = tested[[ledger.closures[row].tried < newest for row in tested.tolist()]]
-        if not tested.size:
-            return []
-        least_sure = int(np.argmax([ledger.closures[row].chance for row in tested.tolist()]))
-        now, within = closure_numbers(solver, ledger, tested, False), self.policy.closure_place_m
-        near = [np.linalg.norm(T[:, :-1, -1] - T[least_sure, :-1, -1], axis=1) <= within for T in (now.a, now.b)]
-        on_trial = [ledger.closures[row] for row in tested[near[0] & near[1]].tolist()]
-        stay = [(c, c.state, c.reason, c.distance, c.chance, int(ids.max())) for c in on_trial]
+        """Without closures that are in: where the rivals are believed then, and are more likely right than these, they
+        go in instead.
+
+        Rivals of several places are held against the closures of one place, the least sure; those of one place against
+        the least sure closure, if that is not sure by all others that are in.
+        """
+        newest = int(np.sort([ledger.closures[row].factor_id for row in rivals.tolist()])[-_RETRY])
+        numbers, within = closure_numbers(solver, ledger, rivals, False), self.policy.closure_place_m
+        several = np.unique(closure_places(numbers, within)).size > 1
+        untried = np.array([row for row in ledger.tested().tolist() if ledger.closures[row].tried < newest], np.int64)
+        find = self._least_sure_place if several else self._least_sure
+        on_trial, odds, stay = find(solver, ledger, untried)
+        if not on_trial:
+            return stay
+        last = max(ledger.closures[row].factor_id for row in rivals.tolist())
+        stay += [(c, c.state, c.reason, c.distance, c.chance if several else odds, last) for c in on_trial]
+        rows = np.concatenate([[c.row for c in on_trial], rivals])
+        numbers = numbers_without(closure_numbers(solver, ledger, rows), len(on_trial))
+        if not _believes(choose_closures(numbers, self._extent(solver, ledger), self.policy, ledger.odds())):
+            return stay  # by the linear model, which takes no step
         try:
             without = without_factors(solver, [c.factor_id for c in on_trial])
         except SolverError:
@@ -178,11 +200,50 @@ class ClosureJudge:
         chosen = self._chosen(without, ledger, rivals)
         believed = np.array([reason in _BELIEVED for reason in chosen.reasons])
         numbers = closure_numbers(without, ledger, rivals[believed], False)
-        if not believed.any() or np.unique(closure_places(numbers, within)).size < 2:
+        places = np.unique(closure_places(numbers, within)).size if believed.any() else 0
+        is_more_likely = places > 0 and chosen.chance[believed].min() <= self.policy.closure_chance_max * odds
+        if not (places > 1 if several else is_more_likely):
             return stay
-        return [(c, SUSPECT, CONTRADICTED, *row[3:]) for c, row in zip(on_trial, stay, strict=True)] + _rows(
-            ledger, rivals, chosen
+        out = [(c, SUSPECT, CONTRADICTED, c.distance, c.chance, last) for c in on_trial]
+        gone = {c.factor_id for c in on_trial}
+        return [row for row in stay if row[0].factor_id not in gone] + out + _rows(ledger, rivals, chosen)
+
+    def _least_sure_place(
+        self, solver: Solver, ledger: Ledger, untried: I64
+    ) -> tuple[list[Closure], float, list[_Row]]:
+        """Of the newest that are in, the closures of the place of the one that was least sure when it came."""
+        tested = untried[-_NEWEST:]
+        if not tested.size:
+            return [], 1.0, []
+        least_sure = int(np.argmax([ledger.closures[row].chance for row in tested.tolist()]))
+        now, within = closure_numbers(solver, ledger, tested, False), self.policy.closure_place_m
+        near = [np.linalg.norm(T[:, :-1, -1] - T[least_sure, :-1, -1], axis=1) <= within for T in (now.a, now.b)]
+        return [ledger.closures[row] for row in tested[near[0] & near[1]].tolist()], 1.0, []
+
+    def _least_sure(self, solver: Solver, ledger: Ledger, untried: I64) -> tuple[list[Closure], float, list[_Row]]:
+        """The one that is least sure by all the others, and its odds; and the rest that may have been, with theirs."""
+        if ledger.dim != _PLANE_DIM:
+            return [], 1.0, []
+        least = self.policy.closure_sets_max
+        chance = np.array([ledger.closures[row].chance for row in untried.tolist()])
+        unsure = untried[np.argsort(-chance, kind="stable")][: min(_WORST, np.count_nonzero(chance > least))]
+        if not unsure.size:
+            return [], 1.0, []
+        odds = odds_without(closure_numbers(solver, ledger, unsure), self.limits[ledger.dim].spread)
+        closures = [ledger.closures[row] for row in unsure.tolist()]
+        worst = int(odds.argmax())
+        on_trial = [closures[worst]] if odds[worst] > least else []
+        rows = zip(closures, odds.tolist(), strict=True)
+        return (
+            on_trial,
+            float(odds[worst]),
+            [(c, c.state, c.reason, c.distance, p, c.tried) for c, p in rows if c not in on_trial],
         )
+
+
+def _believes(chosen: Chosen) -> bool:
+    """Whether any is believed."""
+    return any(reason in _BELIEVED for reason in chosen.reasons)
 
 
 def _as_suspect(c: Closure, reason: str) -> _Row:
@@ -205,7 +266,7 @@ def closure_numbers(solver: Solver, ledger: Ledger, rows: I64, with_covariance: 
     ends, graph = ledger.ends[rows], solver._graph
     listed = ends.reshape(-1).tolist()
     place = {v: k for k, v in enumerate(dict.fromkeys(listed))}
-    different, where = np.array(list(place)), np.array([place[v] for v in listed])
+    different, where = np.array(list(place), np.int64), np.array([place[v] for v in listed], np.int64)
     T = motions_of_poses(graph.values[graph.var[different, at.V_AT, None] + np.arange(ledger.size)])[where]
     known = np.empty((0, 0))
     if with_covariance:

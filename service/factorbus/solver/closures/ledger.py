@@ -98,8 +98,8 @@ class Ledger:
     bound (n, d, d): rᵀ W r is no less than d² of one that is in, and no more than that of a suspect, for as long as the
     map only gets factors, to first order; NaN: not known.  Nothing but work depends on it.
     ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out;
-    is_improbable (n,): a suspect for that reason.  looked (n,): when it was last looked at, in looks.
-    All have room behind for more.
+    is_improbable (n,): a suspect for that reason; accepted, improbable: how many are in, and are that.
+    looked (n,): when it was last looked at, in looks.  All columns have room behind for more.
     """
 
     def __init__(self, kind: str) -> None:
@@ -109,6 +109,7 @@ class Ledger:
         self.z, self.noise, self.bound = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
         self.ends, self.looked = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
         self.is_suspect, self.is_tested, self.is_improbable = (np.zeros(0, bool) for _ in range(3))
+        self.accepted = self.improbable = 0
 
     def add(self, closure: Closure, ends: Sequence[int], looked: int) -> None:
         """One more."""
@@ -128,6 +129,7 @@ class Ledger:
         for row, closure in enumerate(new, n):
             closure.row = row
             self.is_suspect[row], self.is_tested[row] = closure.state == SUSPECT, closure.state == ACCEPTED
+            self.accepted += closure.state == ACCEPTED
         self.closures += new
 
     def _make_room(self, need: int) -> None:
@@ -149,17 +151,17 @@ class Ledger:
             self.bound[row] = weight @ np.linalg.inv(self.bound[row]) @ weight
         elif self.is_suspect[row] != is_suspect:
             self.bound[row] = np.nan
-        self.is_suspect[row], self.is_tested[row] = is_suspect, closure.state == ACCEPTED
-        self.is_improbable[row] = is_suspect and closure.reason == IMPROBABLE
+        is_tested, is_improbable = closure.state == ACCEPTED, is_suspect and closure.reason == IMPROBABLE
+        self.accepted += is_tested - bool(self.is_tested[row])
+        self.improbable += is_improbable - bool(self.is_improbable[row])
+        self.is_suspect[row], self.is_tested[row], self.is_improbable[row] = is_suspect, is_tested, is_improbable
 
     def odds(self) -> float:
         """Of a closure to be false, by those that have come (Laplace's rule), and even at most.
 
         Improbable ones count as false, those that are in as right.
         """
-        n = len(self.closures)
-        false, right = np.count_nonzero(self.is_improbable[:n]), np.count_nonzero(self.is_tested[:n])
-        return min((1 + false) / (1 + right), 1.0)
+        return min((1 + self.improbable) / (1 + self.accepted), 1.0)
 
     def suspects(self) -> I64:
         """Rows."""

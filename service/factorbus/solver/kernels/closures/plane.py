@@ -46,7 +46,7 @@ def judge_each_plane(a: F64, b: F64, z: F64, noise: F64, known: F64, out: F64) -
 def weights_without_plane(a: F64, b: F64, noise: F64, known: F64, out: F64) -> None:
     """(N − P)⁻¹ = (L (I − L⁻¹ P L⁻ᵀ) Lᵀ)⁻¹ with N = L Lᵀ, of closures that the map has; arguments as above.
 
-    out  (n, 3, 3); NaN where a pivot is below HELD: along some axis the closure alone holds what it measures
+    out  (n, 3, 3); an axis whose pivot is below HELD is left out: the closure alone holds what it measures along it
     """
     J, P, B, L, K = np.zeros((3, 6)), np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     for k in range(len(a)):
@@ -55,20 +55,19 @@ def weights_without_plane(a: F64, b: F64, noise: F64, known: F64, out: F64) -> N
         P[:, :] = 0.0
         for m in range(4):
             add_predicted(J, 3 * (m // 2), 6 * k + 3 * (m // 2), 3 * (m % 2), 6 * k + 3 * (m % 2), known, P)
-        lower_factor(noise[k], L)
+        lower_factor(noise[k], 0.0, L)
         solve_lower(L, P)  # P := L⁻¹ P L⁻ᵀ, which is symmetric
         turn(P)
         solve_lower(L, P)
         for r in range(3):
             for c in range(3):
                 P[r, c], B[r, c] = (1.0 if r == c else 0.0) - P[r, c], 1.0 if r == c else 0.0
-        lower_factor(P, K)
-        held = not (K[0, 0] * K[0, 0] > HELD and K[1, 1] * K[1, 1] > HELD and K[2, 2] * K[2, 2] > HELD)
+        lower_factor(P, HELD, K)
         solve_lower(L, B)
         solve_lower(K, B)
         for r in range(3):
             for c in range(3):
-                out[k, r, c] = math.nan if held else B[0, r] * B[0, c] + B[1, r] * B[1, c] + B[2, r] * B[2, c]
+                out[k, r, c] = B[0, r] * B[0, c] + B[1, r] * B[1, c] + B[2, r] * B[2, c]
 
 
 @inline_kernel
@@ -89,14 +88,17 @@ def turn(B: F64) -> None:
 
 
 @inline_kernel
-def lower_factor(S: F64, L: F64) -> None:
-    """L Lᵀ = S."""
+def lower_factor(S: F64, least: float, L: F64) -> None:
+    """L Lᵀ = S; infinite where a pivot is not above `least`."""
     for r in range(3):
         for c in range(r + 1):
             total = S[r, c]
             for m in range(c):
                 total -= L[r, m] * L[c, m]
-            L[r, c] = math.sqrt(total) if r == c else total / L[c, c]
+            if r > c:
+                L[r, c] = total / L[c, c]
+            else:
+                L[r, c] = math.sqrt(total) if total > least else math.inf
 
 
 @kernel(
