@@ -92,7 +92,8 @@ def _random(truth: np.ndarray, rng: np.random.Generator) -> _Found:
 def _local(truth: np.ndarray, rng: np.random.Generator) -> _Found:
     size = _places(truth)
     pose = int(rng.integers(_GAP + 5, len(truth)))
-    here = np.flatnonzero(np.linalg.norm(truth[: pose - _GAP, :size] - truth[pose, :size], axis=1) <= 3.0)
+    distance = np.linalg.norm(truth[: pose - _GAP, :size] - truth[pose, :size], axis=1)
+    here = np.flatnonzero(distance <= (3.0 if size == 2 else max(3.0, distance.min())))
     off = rng.uniform(-5.0, 5.0, size)
     if not here.size or not 0.5 < np.linalg.norm(off) < 5.0:
         return []

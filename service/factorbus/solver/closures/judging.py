@@ -55,7 +55,7 @@ CONTRADICTED = "contradicted"
 _NEWEST = 40  # suspects, or accepted ones, among which places are looked for
 _BELIEVED = {PASSED, AGREES}
 _PLANE_DIM, _SPACE_DIM = 3, 6
-_WORST = 8  # accepted ones whose d² is computed in a step
+_WORST = 4  # accepted ones whose d² is computed in a step
 _RETRY = 2  # rivals that have to be new before the same closures are tried again
 
 _Row: TypeAlias = tuple[Closure, str, str, float, float, int]
