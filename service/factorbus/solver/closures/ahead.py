@@ -92,12 +92,13 @@ def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, 
         ledgers.looks += 1
         ledgers.moved_at = ledgers.looks
     made, bounds = list[Closure](), seen.judged[:, ahead.J_BOUND : ahead.J_MEASURED]
+    if not all(staged.believed):
+        out = ~np.array(staged.believed)
+        bounds[out] = np.linalg.inv(seen.judged[out, ahead.J_ALLOWED : ahead.J_NOISE])
     for k, place in enumerate(split.closing_at.tolist()):
         state, reason = (ACCEPTED, PASSED) if staged.believed[k] else (SUSPECT, NEW)
         told = state, reason, seen.distance[k], seen.chance[k], revision
         made.append(Closure(first + place, 0, split.closing[k], revision, *told))
-        if state == SUSPECT:
-            bounds[k] = np.linalg.inv(seen.judged[k, ahead.J_ALLOWED : ahead.J_NOISE])
     z, noise = seen.judged[:, ahead.J_MEASURED :], seen.judged[:, ahead.J_NOISE : ahead.J_WEIGHT]
     ledgers.enter(_PLANE, made, seen.ends, z, noise, bounds)
     return made

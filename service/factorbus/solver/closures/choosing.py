@@ -26,6 +26,7 @@ from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.kernels.jit.compile import F64, I64
 
 PASSED, AGREES, UNSURE, IMPROBABLE = "passed", "agrees", "unsure", "improbable"
+LEAST_RIVALS = 3  # that agree, against what the map says
 _LEAST_CHANCE = 1e-12
 _MOST_BRANCHES = 20_000
 
@@ -118,7 +119,7 @@ class _Sets:
     def rivals(self, among: I64) -> list[int]:
         """The largest one among some, three or more, that is not by chance of independent ones."""
         members = self._largest(among)
-        if members.size < 3:
+        if members.size < LEAST_RIVALS:
             return []
         return members.tolist() if self._is_set(members, among.size) else []
 

@@ -19,6 +19,7 @@ import numpy as np
 from factorbus.solver.closures.choosing import (
     AGREES,
     IMPROBABLE,
+    LEAST_RIVALS,
     PASSED,
     Chosen,
     choose_closures,
@@ -71,11 +72,9 @@ class ClosureJudge:
     def look(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
         """Judge new ones of a kind, and suspects that may be believed now; None: none is.  Raises SolverError."""
         ledger = ledgers.of_kind[kind]
-        suspects = ledger.suspects()
-        if not suspects.size:
+        if not ledger.is_suspect[: len(ledger.closures)].any():
             return None
-        new = ledger.unjudged(suspects)
-        looked_at, settled = self._revisited(solver, ledgers, ledger, suspects, new)
+        looked_at, settled = self._revisited(solver, ledgers, ledger, ledger.unjudged())
         alone = [_as_suspect(ledger.closures[row], IMPROBABLE) for row in settled.tolist()]
         if not looked_at.size:
             return verdicts_of(alone) if alone else None
@@ -127,28 +126,29 @@ class ClosureJudge:
         starts = var[var[:, at.V_KIND] == (at.SE2 if ledger.dim == _PLANE_DIM else at.SE3), at.V_AT]
         return float(np.ptp(graph.values[starts[:, None] + np.arange(2)], axis=0).max()) / 2.0
 
-    def _revisited(
-        self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger, suspects: I64, new: I64
-    ) -> tuple[I64, I64]:
-        """What to look at, and new ones that are improbable as nothing agrees with them.
+    def _revisited(self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger, new: I64) -> tuple[I64, I64]:
+        """What to look at, and new ones that are improbable, as too few agree with them for the map to be wrong.
 
         With new ones go, of the newest suspects that are unsure those of many places, and of those that are not, what
         agrees with a new one; and what may be believed now that the map has moved, first what was not looked at for
         longest.
         """
         most, out, settled, picked = self.policy.closure_revisits, self.limits[ledger.dim].out, new[:0], new
+        others = ledger.is_suspect[: len(ledger.closures)].copy()
+        others[new] = False
         if new.size:
-            among = np.setdiff1d(suspects[-4 * _NEWEST :], new, assume_unique=True)
+            among = np.flatnonzero(others)[-4 * _NEWEST :]
             is_improbable = ledger.is_improbable[among]
             companions = self._companions(solver, ledger, new, np.ascontiguousarray(among[is_improbable][::-1]))
-            if not companions.size:
+            if companions.size + new.size < LEAST_RIVALS:
                 is_settled = np.array([ledger.closures[row].distance > out for row in new.tolist()])
                 settled, picked = new[is_settled], new[~is_settled]
             if picked.size:
                 unsure = among[~is_improbable][-_NEWEST:][::-1]
                 picked = np.concatenate([picked, self._of_many_places(solver, ledger, unsure), companions[: most // 2]])
-        left = suspects[ledger.looked[suspects] < ledgers.moved_at]
-        if left.size and (left := np.setdiff1d(left, np.union1d(picked, new), assume_unique=True)).size:
+        others[picked] = False
+        left = np.flatnonzero(others & (ledger.looked[: others.size] < ledgers.moved_at))
+        if left.size:
             left = left[~(residuals_weighed(solver, ledger, left) > out)]
             longest = left[np.argsort(ledger.looked[left], kind="stable")]
             picked = np.concatenate([picked, longest[: max(most + new.size - picked.size, 0)]])

@@ -22,7 +22,7 @@ CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 _BELIEVED = {ACCEPTED, RESTORED}
-_COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_tested", "is_improbable")
+_COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_new", "is_tested", "is_improbable")
 
 
 @dataclass(slots=True, eq=False)
@@ -98,7 +98,7 @@ class Ledger:
     bound (n, d, d): rᵀ W r is no less than d² of one that is in, and no more than that of a suspect, for as long as the
     map only gets factors, to first order; NaN: not known.  Nothing but work depends on it.
     ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out;
-    is_improbable (n,): a suspect for that reason; accepted, improbable: how many are in, and are that.
+    is_new, is_improbable (n,): a suspect for that reason; accepted, improbable: how many are in, and are that.
     looked (n,): when it was last looked at, in looks.  All columns have room behind for more.
     """
 
@@ -108,7 +108,7 @@ class Ledger:
         k, d = 3 if self.dim == 3 else 4, self.dim
         self.z, self.noise, self.bound = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
         self.ends, self.looked = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
-        self.is_suspect, self.is_tested, self.is_improbable = (np.zeros(0, bool) for _ in range(3))
+        self.is_suspect, self.is_new, self.is_tested, self.is_improbable = (np.zeros(0, bool) for _ in range(4))
         self.accepted = self.improbable = 0
 
     def add(self, closure: Closure, ends: Sequence[int], looked: int) -> None:
@@ -128,7 +128,8 @@ class Ledger:
         self.z[n:count], self.noise[n:count], self.bound[n:count] = z, noise, bound
         for row, closure in enumerate(new, n):
             closure.row = row
-            self.is_suspect[row], self.is_tested[row] = closure.state == SUSPECT, closure.state == ACCEPTED
+            self.is_suspect[row] = self.is_new[row] = closure.state == SUSPECT
+            self.is_tested[row] = closure.state == ACCEPTED
             self.accepted += closure.state == ACCEPTED
         self.closures += new
 
@@ -155,6 +156,7 @@ class Ledger:
         self.accepted += is_tested - bool(self.is_tested[row])
         self.improbable += is_improbable - bool(self.is_improbable[row])
         self.is_suspect[row], self.is_tested[row], self.is_improbable[row] = is_suspect, is_tested, is_improbable
+        self.is_new[row] = is_suspect and closure.reason == NEW
 
     def odds(self) -> float:
         """Of a closure to be false, by those that have come (Laplace's rule), and even at most.
@@ -171,9 +173,9 @@ class Ledger:
         """Rows."""
         return np.flatnonzero(self.is_tested[: len(self.closures)])
 
-    def unjudged(self, suspects: I64) -> I64:
-        """Of these rows those that nobody has looked at."""
-        return suspects[[self.closures[row].reason == NEW for row in suspects.tolist()]]
+    def unjudged(self) -> I64:
+        """Rows of suspects that nobody has looked at."""
+        return np.flatnonzero(self.is_new[: len(self.closures)])
 
 
 class ClosureLedger:
