@@ -225,17 +225,25 @@ class TestedMapSolver(MapSolver):
     def _judged(self, kinds: Iterable[str]) -> Iterator[Verdict | Stepped]:
         """The judge looks at the new closures of these kinds, and what it says is applied."""
         for kind in kinds:
-            for look in (self._judge.look, self._judge.look_back):
-                try:
-                    verdicts = look(self._solver, self._ledger, kind)
-                except SolverError as problem:
-                    log.warning("closures are not judged, and stay as they are: %s", problem)
-                    return
-                except Exception:
-                    log.exception("closures are not judged, and stay as they are: the judge failed")
-                    return
-                if verdicts is not None and not (yield from self._enter(verdicts)):
-                    yield from self._enter(self._ledger.failed(verdicts))
+            while (verdicts := self._looked(self._judge.look, kind)) is not None:
+                yield from self._enter_or_keep(verdicts)
+            if (verdicts := self._looked(self._judge.look_back, kind)) is not None:
+                yield from self._enter_or_keep(verdicts)
+
+    def _looked(self, look: Callable[..., ClosureVerdicts | None], kind: str) -> ClosureVerdicts | None:
+        """What the judge says; None: nothing, or it failed."""
+        try:
+            return look(self._solver, self._ledger, kind)
+        except SolverError as problem:
+            log.warning("closures are not judged, and stay as they are: %s", problem)
+        except Exception:
+            log.exception("closures are not judged, and stay as they are: the judge failed")
+        return None
+
+    def _enter_or_keep(self, verdicts: ClosureVerdicts) -> Iterator[Verdict | Stepped]:
+        """Apply them; where their step fails, what was to go in are suspects."""
+        if not (yield from self._enter(verdicts)):
+            yield from self._enter(self._ledger.failed(verdicts))
 
     def _enter(self, verdicts: ClosureVerdicts) -> Generator[Verdict | Stepped, None, bool]:
         """Apply them as an entry that comes behind the insert; gives whether they are."""

@@ -66,9 +66,10 @@ class GatedSolver:
         new = add_closures(self.solver._graph, self.ledger, split, first, self._steps)
         before = {c.factor_id: c.is_in for c in self.closures} if new else {}
         for kind in dict.fromkeys(c.factor.kind for c in new):
-            for look in (self.judge.look, self.judge.look_back):
-                if (verdicts := look(self.solver, self.ledger, kind)) is not None:
-                    report = self._apply_or_keep(verdicts) or report
+            while (verdicts := self.judge.look(self.solver, self.ledger, kind)) is not None:
+                report = self._apply_or_keep(verdicts) or report
+            if (verdicts := self.judge.look_back(self.solver, self.ledger, kind)) is not None:
+                report = self._apply_or_keep(verdicts) or report
         changed = [c for c in self.closures if c.is_in != before.get(c.factor_id, c.is_in)]
         return GatedReport(
             report,

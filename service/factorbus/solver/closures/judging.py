@@ -39,6 +39,7 @@ _NEWEST = 40  # suspects, or accepted ones, among which places are looked for
 _BELIEVED = {PASSED, AGREES}
 _EXPECTED = 3.0  # rᵀ Ω r of one accepted closure that is worth a look, for each of its numbers
 _WORST = 4  # accepted ones whose d² is computed in a step
+_TOGETHER = 64  # new closures that are judged together: each two of them are compared
 _RETRY = 2  # rivals that have to be new before the same closures are tried again
 
 _Row: TypeAlias = tuple[Closure, str, str, float, float, int]
@@ -51,12 +52,15 @@ class ClosureJudge:
         self.policy = policy or ClosurePolicy()
 
     def look(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
-        """Judge new ones of a kind, with some suspects; None: there is no new one.  Raises SolverError."""
+        """Judge new ones of a kind, the oldest where there are many, with some suspects; None: there is no new one.
+
+        Raises SolverError.
+        """
         ledger = ledgers.of_kind[kind]
-        new = ledger.unjudged()
+        new = ledger.unjudged()[:_TOGETHER]
         if not new.size:
             return None
-        looked_at = np.union1d(self._revisited(solver, ledgers, ledger, np.setdiff1d(ledger.suspects(), new)), new)
+        looked_at = np.union1d(self._revisited(solver, ledgers, ledger, ledger.judged_suspects()), new)
         chosen = self._chosen(solver, ledger, looked_at)
         rows = _rows(ledger, looked_at, chosen)
         if chosen.rivals and not any(reason in _BELIEVED for reason in chosen.reasons):

@@ -139,6 +139,10 @@ class Ledger:
         """Rows of those that nobody has looked at."""
         return np.array([row for row in self.suspects().tolist() if self.closures[row].reason == NEW], np.int64)
 
+    def judged_suspects(self) -> I64:
+        """Rows of the other suspects."""
+        return np.setdiff1d(self.suspects(), self.unjudged())
+
 
 class ClosureLedger:
     """All closures of a map, in the order in which they came.
