@@ -10,7 +10,7 @@ from tested_maps import TestedMap, between, corridor, right
 
 from factorbus.journal.records import ACCEPTED, REFUSED
 from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, JUDGE, JudgedClosures, decode_judged
-from factorbus.proto.messages import Batch, Change, Variables
+from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.service.core.events import Arrived, Verdict, refusal
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.closures import ledger
@@ -226,3 +226,31 @@ def test_an_entry_of_the_judge_is_what_it_was() -> None:
     assert isinstance(again, JudgedClosures)
     assert (again.states, again.reasons, again.tried.tolist()) == (("accepted",), ("passed",), [-1])
     assert made.judged() == 1
+
+
+def test_many_closures_at_once_are_judged_in_several_looks() -> None:
+    made = driven(40)
+    factors = tuple(right(k, 40) for k in range(1, 40)) * 2
+    (accepted,) = made.insert(Batch((), factors))
+    assert (accepted.report["closures"], accepted.report["suspects"]) == (78, 0)
+    assert made.judged() == 2, "64 and the rest"
+    assert made.in_graph() == made.ids
+    made.kill()
+    made.kill(made.solver.dump(), len(made.records))
+
+
+def test_in_space_the_same() -> None:
+    made, triangle = TestedMap(), np.diag([2500.0] * 3 + [10_000.0] * 3)[np.triu_indices(6)][None]
+
+    def pose_between(i: int, j: int, x: float) -> Factors:
+        return Factors("between_se3", ids(i, j)[None], np.array([[x, 0.0, 0, 0, 0, 0, 1]]), triangle)
+
+    made.insert(Batch((Variables("se3", ids(0), np.array([[0.0] * 6 + [1.0]]), True),)))
+    for k in range(1, 9):
+        made.insert(Batch((Variables("se3", ids(k)),), (pose_between(k - 1, k, 1.0),)))
+    (accepted,) = made.insert(Batch((), (pose_between(2, 5, 3.0), pose_between(1, 7, 2.0))))
+    assert (accepted.report["closures"], accepted.report["suspects"]) == (2, 1)
+    assert made.states() == {8: "accepted", 9: "suspect"}
+    state = made.solver.dump()
+    made.change(Change("accept", ids(9)))
+    made.kill(state, len(made.records) - 1)

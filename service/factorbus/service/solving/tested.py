@@ -72,7 +72,8 @@ class TestedMapSolver(MapSolver):
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        self._ledger, self._forest, self._entries = ClosureLedger(), TrustedForest(), 0
+        self._ledger, self._forest = ClosureLedger(), TrustedForest()
+        self._entries = 0  # verdicts that were entered since
 
     # ---- as of any map solver ---------------------------------------------------------------------------------------
 
@@ -123,8 +124,7 @@ class TestedMapSolver(MapSolver):
 
     def dump(self) -> dict[str, Any]:
         """With what became of closures."""
-        own = {"ledger": self._ledger.dump(), "forest": self._forest.dump(), "entries": self._entries}
-        return super().dump() | {"closures": own}
+        return super().dump() | {"closures": {"ledger": self._ledger.dump(), "forest": self._forest.dump()}}
 
     def load(self, state: Mapping[str, Any] | None) -> bool:
         """With what became of closures."""
@@ -134,7 +134,6 @@ class TestedMapSolver(MapSolver):
             own = state["closures"]
             self._ledger.load(own["ledger"], self._solver.factor_graph)
             self._forest.load(own["forest"])
-            self._entries = int(own["entries"])
         return same
 
     def closure_counts(self) -> dict[str, int]:
@@ -247,12 +246,12 @@ class TestedMapSolver(MapSolver):
 
     def _enter(self, verdicts: ClosureVerdicts) -> Generator[Verdict | Stepped, None, bool]:
         """Apply them as an entry that comes behind the insert; gives whether they are."""
-        content = JudgedClosures(self._entries + 1, *verdicts)
+        self._entries += 1
+        content = JudgedClosures(self._entries, *verdicts)
         message = encode_judged(content)
         return (yield from self._apply_judged(judged_again(message, content), content))
 
     def _apply_judged(self, insert: Arrived, content: JudgedClosures) -> Generator[Verdict | Stepped, None, bool]:
-        self._entries = content.sequence
         verdicts = ClosureVerdicts(*(getattr(content, name) for name in ClosureVerdicts._fields))
         try:
             switch = planned_switch(self._solver.factor_graph, self._ledger, verdicts)
