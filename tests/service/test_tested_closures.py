@@ -62,6 +62,20 @@ def test_verdicts_are_entries_behind_their_insert() -> None:
     ]
 
 
+def test_suspects_are_looked_at_again_when_the_map_has_got_or_lost_closures() -> None:
+    made = driven(40)
+    for n in range(30):  # more than one look is at
+        made.insert(Batch((), (between(20 + n, 2, [9.0, 9.0, 1.0 + 0.01 * n]),)))
+    assert set(made.states().values()) == {"suspect"}
+    ledger_of = made.solver._ledger.of_kind["between_se2"]  # type: ignore[attr-defined]
+    before = ledger_of.looked[:30].copy()
+    assert before.max() == 30
+    for k in range(1, 20, 3):
+        made.insert(Batch((), (right(k, 40),)))
+    assert "accepted" in made.states().values()
+    assert (ledger_of.looked[:30] > before).all(), "each of them, a few at a time"
+
+
 def test_a_journal_is_run_again_by_its_verdicts_and_not_by_judging(monkeypatch: pytest.MonkeyPatch) -> None:
     made = driven()
     made.insert(Batch((), (right(1, LENGTH), between(2, 15, [3.0, 0.0, 3.14]))))
@@ -131,7 +145,8 @@ def test_trusted_factors_and_those_of_changes_are_not_tested() -> None:
 def test_poses_that_went_and_came_again_are_joined_anew() -> None:
     made = driven()
     made.change(Change("remove_variables", keys=ids(16)))
-    made.insert(Batch((Variables("se2", ids(16)),), (between(1, 16, [0.5, 0.0, 3.14]),)))
+    (accepted,) = made.insert(Batch((Variables("se2", ids(16)),), (between(1, 16, [0.5, 0.0, 3.14]),)))
+    assert accepted.first_factor == 16
     assert made.states() == {}, "nothing else joins it"
     made.kill()
 

@@ -254,7 +254,7 @@ class TestedMapSolver(MapSolver):
     def _apply_judged(self, insert: Arrived, content: JudgedClosures) -> Generator[Verdict | Stepped, None, bool]:
         verdicts = ClosureVerdicts(*(getattr(content, name) for name in ClosureVerdicts._fields))
         try:
-            switch = planned_switch(self._solver.factor_graph, self._ledger, verdicts)
+            switch = planned_switch(self._ledger, verdicts)
         except SolverError as problem:
             yield Verdict((refusal(insert, problem),))
             return False
@@ -341,7 +341,7 @@ class TestedMapSolver(MapSolver):
                 left.append(change._replace(factors=np.array([i for i in ids if i not in gone])) if out else change)
         verdicts = _together(said)
         _check_once("accept, reject and remove_factors", [*verdicts.factors.tolist(), *gone])
-        switch = planned_switch(self._solver.factor_graph, self._ledger, verdicts)
+        switch = planned_switch(self._ledger, verdicts)
         removals = [Change("remove_factors", removal.factors) for removal in switch.removals]
         batch: Any = content.batch._replace(factors=(*content.batch.factors, *switch.additions))
         made = content._replace(batch=batch, changes=(*removals, *left))

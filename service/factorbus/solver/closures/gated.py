@@ -99,7 +99,7 @@ class GatedSolver:
 
     def _apply(self, verdicts: ClosureVerdicts) -> StepReport | None:
         """Make the step that verdicts ask for, if any; None: nothing goes in or out."""
-        switch = planned_switch(self.solver._graph, self.ledger, verdicts)
+        switch = planned_switch(self.ledger, verdicts)
         following, report = self.solver._graph.next_id, None
         if switch.out:
             batch = Addition((), switch.additions)

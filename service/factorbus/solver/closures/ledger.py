@@ -20,7 +20,7 @@ ACCEPTED, SUSPECT, REJECTED, RESTORED = "accepted", "suspect", "rejected", "rest
 CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
-_BELIEVED = {ACCEPTED, RESTORED}
+BELIEVED = {ACCEPTED, RESTORED}
 _COLUMNS = ("z", "noise", "weight", "ends", "looked", "is_suspect", "is_tested")
 
 
@@ -47,7 +47,7 @@ class Closure:
     @property
     def is_in(self) -> bool:
         """Whether the estimate has it."""
-        return self.state in _BELIEVED
+        return self.state in BELIEVED
 
     @property
     def keys(self) -> tuple[int, int]:
@@ -191,7 +191,7 @@ class ClosureLedger:
         rows = []
         for k, c in enumerate(self.named(verdicts.factors.tolist())):
             state, reason = verdicts.states[k], verdicts.reasons[k]
-            if (state in _BELIEVED) != c.is_in:
+            if (state in BELIEVED) != c.is_in:
                 state, reason = (c.state, c.reason) if c.is_in else (SUSPECT, FAILED)
             rows.append((c, state, reason, verdicts.distance[k], verdicts.chance[k], int(verdicts.tried[k])))
         return verdicts_of(rows)
