@@ -5,10 +5,10 @@ import numpy as np
 from factorbus.proto import codec
 from factorbus.proto.closures import (
     AskSuspects,
-    JudgedClosures,
+    ClosureEntry,
     Suspects,
     encode_ask_suspects,
-    encode_judged,
+    encode_closure_entry,
     encode_suspects,
 )
 from factorbus.proto.messages import Batch, Change, Factors, Insert
@@ -22,8 +22,8 @@ def messages() -> dict[str, bytes]:
     x = [symbol("x", n) for n in range(4)]
     omega = np.array([[16.0, 0, 0, 16, 0, 4]])
     edge = Factors("between_se2", np.array([[x[0], x[2]]]), np.array([[2.0, 0.5, 0.25]]), omega, trusted=True)
-    judged = encode_judged(
-        JudgedClosures(
+    judged = encode_closure_entry(
+        ClosureEntry(
             1,
             np.array([_FALSE]),
             ("suspect",),
@@ -45,7 +45,7 @@ def messages() -> dict[str, bytes]:
         "ask_suspects_all": encode_ask_suspects(AskSuspects(True)),
         "suspects": encode_suspects(found),
         "suspects_none": encode_suspects(Suspects(_EPOCH, 4, "trust")),
-        "judged": judged,
+        "closure_entry": judged,
         "insert_overrides": codec.encode_insert(Insert(7, Batch(), epoch=_EPOCH, changes=said)),
         "insert_trusted": codec.encode_insert(Insert(8, Batch(factors=(edge,)), epoch=_EPOCH)),
         "event_closures": codec.encode_map(

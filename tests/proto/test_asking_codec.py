@@ -35,7 +35,7 @@ CODECS: dict[str, tuple[Callable[[Any], bytes], Callable[[bytes], Any]]] = {
     "repaired": (repair_codec.encode_repaired, repair_codec.decode_repaired),
     "ask_suspects": (closures.encode_ask_suspects, closures.decode_ask_suspects),
     "suspects": (closures.encode_suspects, closures.decode_suspects),
-    "judged": (closures.encode_judged, closures.decode_judged),
+    "closure_entry": (closures.encode_closure_entry, closures.decode_closure_entry),
 }
 VECTORS = sorted(name for name in GOLDEN if any(name.startswith(known) for known in CODECS))
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tested_maps import TestedMap, between, corridor, right
 
 from factorbus.journal.records import ACCEPTED, REFUSED
-from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, JUDGE, JudgedClosures, decode_judged
+from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, JUDGE, ClosureEntry, decode_closure_entry
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.service.core.events import Arrived, Verdict, refusal
 from factorbus.service.solving.apply import MapSolver
@@ -55,7 +55,7 @@ def test_verdicts_are_entries_behind_their_insert() -> None:
     made.insert(Batch((), (right(1, LENGTH),)), Batch((), (between(2, 15, [3.0, 0.0, 3.14]),)))
     entries = made.records[-1].entries
     assert [entry.client for entry in entries] == ["robot", JUDGE, "robot", JUDGE]
-    verdicts = [decode_judged(entry.message) for entry in entries if entry.client == JUDGE]
+    verdicts = [decode_closure_entry(entry.message) for entry in entries if entry.client == JUDGE]
     assert [(v.sequence, v.factors.tolist(), v.states) for v in verdicts] == [
         (1, [16], ("accepted",)),
         (2, [17], ("suspect",)),
@@ -237,8 +237,8 @@ def test_an_entry_of_the_judge_is_what_it_was() -> None:
     made = driven()
     made.insert(Batch((), (right(1, LENGTH),)))
     entry = made.records[-1].entries[1]
-    again = decode_judged(entry.message)
-    assert isinstance(again, JudgedClosures)
+    again = decode_closure_entry(entry.message)
+    assert isinstance(again, ClosureEntry)
     assert (again.states, again.reasons, again.tried.tolist()) == (("accepted",), ("passed",), [-1])
     assert made.judged() == 1
 

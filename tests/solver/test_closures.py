@@ -300,7 +300,7 @@ def test_a_policy_out_of_its_range_is_refused(settings_: dict[str, float]) -> No
         ClosurePolicy(**settings_)  # pyright: ignore[reportArgumentType]
 
 
-def test_accepted_ones_are_judged_against_the_map_without_them() -> None:
+def test_accepted_ones_are_entry_against_the_map_without_them() -> None:
     made = driven()
     for k in (1, 3, 5):
         made.insert(closure(k, 17 - k, [0.01 * k, 0.0, math.pi]))

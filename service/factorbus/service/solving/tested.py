@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE, JudgedClosures, Suspects, encode_judged, encode_suspects
+from factorbus.proto.closures import JUDGE, ClosureEntry, Suspects, encode_closure_entry, encode_suspects
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Batch, Change, Insert
 from factorbus.proto.problems import Internal, Problem
@@ -113,7 +113,7 @@ class TestedMapSolver(MapSolver):
                 continue
             yield from self._add_plain(plain)
             plain = []
-            if isinstance(insert.content, JudgedClosures):
+            if isinstance(insert.content, ClosureEntry):
                 yield from self._apply_judged(insert, insert.content)
             elif batch is not None:
                 yield from self._insert_tested(insert, batch)
@@ -247,11 +247,11 @@ class TestedMapSolver(MapSolver):
     def _enter(self, verdicts: ClosureVerdicts) -> Generator[Verdict | Stepped, None, bool]:
         """Apply them as an entry that comes behind the insert; gives whether they are."""
         self._entries += 1
-        content = JudgedClosures(self._entries, *verdicts)
-        message = encode_judged(content)
-        return (yield from self._apply_judged(judged_again(message, content), content))
+        content = ClosureEntry(self._entries, *verdicts)
+        message = encode_closure_entry(content)
+        return (yield from self._apply_judged(entry_again(message, content), content))
 
-    def _apply_judged(self, insert: Arrived, content: JudgedClosures) -> Generator[Verdict | Stepped, None, bool]:
+    def _apply_judged(self, insert: Arrived, content: ClosureEntry) -> Generator[Verdict | Stepped, None, bool]:
         verdicts = ClosureVerdicts(*(getattr(content, name) for name in ClosureVerdicts._fields))
         try:
             switch = planned_switch(self._ledger, verdicts)
@@ -348,7 +348,7 @@ class TestedMapSolver(MapSolver):
         return _Asked(insert._replace(content=made), verdicts, switch, gone)
 
 
-def judged_again(message: bytes, content: JudgedClosures) -> Arrived:
+def entry_again(message: bytes, content: ClosureEntry) -> Arrived:
     """Verdicts as an entry, which nobody waits for."""
     return Arrived([], JUDGE, content.sequence, 0, len(message), int(digest(message)), content, 0.0, message)
 

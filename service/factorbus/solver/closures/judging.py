@@ -60,7 +60,7 @@ class ClosureJudge:
         new = ledger.unjudged()[:_TOGETHER]
         if not new.size:
             return None
-        looked_at = np.union1d(self._revisited(solver, ledgers, ledger, ledger.judged_suspects()), new)
+        looked_at = np.union1d(self._revisited(solver, ledgers, ledger, ledger.older_suspects()), new)
         chosen = self._chosen(solver, ledger, looked_at)
         rows = _rows(ledger, looked_at, chosen)
         if chosen.rivals and not any(reason in _BELIEVED for reason in chosen.reasons):

@@ -139,7 +139,7 @@ class Ledger:
         """Rows of those that nobody has looked at."""
         return np.array([row for row in self.suspects().tolist() if self.closures[row].reason == NEW], np.int64)
 
-    def judged_suspects(self) -> I64:
+    def older_suspects(self) -> I64:
         """Rows of the other suspects."""
         return np.setdiff1d(self.suspects(), self.unjudged())
 
