@@ -56,7 +56,7 @@ class TestedMap:
 
     def insert(self, *contents: Batch, changes: tuple[Change, ...] = ()) -> list[Any]:
         """Into one record; the answers: of those that were refused the problem."""
-        inserts = [self._arrived(content, changes) for content in contents]
+        inserts = [self.arrived(content, changes) for content in contents]
         events, _ = self.solver.apply_whole(inserts)
         record = written(self.last.record + 1, inserts, events, self.last)
         self.records.append(record)
@@ -113,7 +113,7 @@ class TestedMap:
         """Entries of the judge."""
         return sum(entry.client == JUDGE for record in self.records for entry in record.entries)
 
-    def _arrived(self, content: Batch, changes: tuple[Change, ...]) -> Arrived:
+    def arrived(self, content: Batch, changes: tuple[Change, ...] = ()) -> Arrived:
         self._number += 1
         message = codec.encode_insert(Insert(self._number, content, changes=changes))
         arrived = read_insert(None, "robot", message, Limits().message(), 0.0)

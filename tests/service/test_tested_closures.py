@@ -269,3 +269,13 @@ def test_in_space_the_same() -> None:
     state = made.solver.dump()
     made.change(Change("accept", ids(9)))
     made.kill(state, len(made.records) - 1)
+
+
+def test_counts_are_there_whatever_came() -> None:
+    made = driven()
+    made.insert(Batch((), (right(1, LENGTH),)))
+    counts = {"accepted": 1, "suspect": 0, "rejected": 0, "restored": 0}
+    odometry = between(16, 17, [1.0, 0.0, 0.0])
+    for content in (Batch((), (odometry,)), Batch((Variables("se2", ids(17)),), (odometry,)), Batch()):
+        assert made.solver.apply_whole([made.arrived(content)])[1].closures == counts
+    assert made.solver.apply_whole([], further=True)[1].closures == counts

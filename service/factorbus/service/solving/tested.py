@@ -176,7 +176,7 @@ class TestedMapSolver(MapSolver):
                 for outcome in event.outcomes:
                     if outcome.first_factor >= 0 and (batch := _batch_of(outcome.insert)) is not None:
                         self._forest.join(batch)
-            yield event
+            yield event._replace(closures=self._ledger.counts()) if isinstance(event, Applied) else event
 
     def _insert_tested(self, insert: Arrived, batch: Batch) -> Iterator[Verdict | Stepped]:
         """One that may have closures."""
@@ -185,6 +185,7 @@ class TestedMapSolver(MapSolver):
         try:
             if split.closing and not self._broken:
                 self._check_room(self._accepted_counts, batch.variable_count, batch.factor_count)
+                self._solver.check_new_kinds(batch)
                 check_whole(self._solver.factor_graph, batch)
         except (Problem, SolverError) as problem:
             self._forest.forget()
