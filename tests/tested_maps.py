@@ -8,7 +8,7 @@ import numpy as np
 from factorbus.journal import chain
 from factorbus.journal.records import JournalRecord, Last
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE, Suspects, decode_suspects
+from factorbus.proto.closures import CLOSURE_STATES, JUDGE, Suspects, decode_suspects
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Arrived, Outcome, Refuse, Stepped, Verdict
@@ -108,6 +108,10 @@ class TestedMap:
         columns = [(group.keys, group.values) for group in variables]
         columns += [(group.ids, group.measured, group.information) for group in factors]
         return [column.tobytes() for group in columns for column in group]
+
+    def check_counts(self) -> None:
+        states = list(self.states().values())
+        assert self.suspects().counts == {state: states.count(state) for state in CLOSURE_STATES}
 
     def judged(self) -> int:
         """Entries of the judge."""

@@ -229,6 +229,7 @@ def test_whatever_happens_ids_stay_and_the_journal_gives_the_same_bits(happened:
         states = made.states()
         out = {factor for factor, state_ in states.items() if state_ in ("suspect", "rejected")}
         assert not states.keys() & gone
+        made.check_counts()
         assert made.in_graph() == {factor: keys for factor, keys in made.ids.items() if factor not in gone | out}
     made.kill()
 

@@ -90,9 +90,8 @@ class ClosureJudge:
         return verdicts_of([(found, SUSPECT, CONTRADICTED, float(d2.max()), found.chance, found.tried)])
 
     def _chosen(self, solver: Solver, ledger: Ledger, rows: I64) -> Chosen:
-        count = len(ledger.closures)
-        every = closure_numbers(solver, ledger, np.arange(count), False)
-        places = np.concatenate([every.a[:, :2, -1], every.b[:, :2, -1]])
+        ends, graph = ledger.ends[: len(ledger.closures)].reshape(-1), solver._graph
+        places = graph.values[graph.var[ends, at.V_AT, None] + np.arange(2)]  # x, y of all poses with closures
         extent = float(np.ptp(places, axis=0).max()) / 2.0
         return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy)
 

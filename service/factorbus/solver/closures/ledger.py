@@ -21,7 +21,7 @@ CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 BELIEVED = {ACCEPTED, RESTORED}
-_COLUMNS = ("z", "noise", "weight", "ends", "looked", "is_suspect", "is_tested")
+_COLUMNS = ("z", "noise", "weight", "ends", "looked", "is_suspect", "is_new", "is_tested")
 
 
 @dataclass(slots=True, eq=False)
@@ -94,7 +94,8 @@ class Ledger:
     """Closures of one kind.
 
     z (n, k, k), noise, weight (n, d, d): what was measured, Ω⁻¹ and Ω in its tangent space, metres and radians.
-    ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out.
+    ends (n, 2): variables.  is_suspect, is_new, is_tested (n,): whether it may go in, nobody has looked at it, it
+    is in and may go out.
     looked (n,): when it was last looked at, in looks.  All have room behind for more.
     """
 
@@ -104,7 +105,7 @@ class Ledger:
         k, d = 3 if self.dim == 3 else 4, self.dim
         self.z, self.noise, self.weight = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
         self.ends, self.looked = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
-        self.is_suspect, self.is_tested = np.zeros(0, bool), np.zeros(0, bool)
+        self.is_suspect, self.is_new, self.is_tested = (np.zeros(0, bool) for _ in range(3))
 
     def add(self, closure: Closure, ends: Sequence[int], looked: int) -> None:
         """One more."""
@@ -125,7 +126,9 @@ class Ledger:
 
     def mark(self, closure: Closure) -> None:
         """Its state has changed."""
-        self.is_suspect[closure.row], self.is_tested[closure.row] = closure.state == SUSPECT, closure.state == ACCEPTED
+        row, is_suspect = closure.row, closure.state == SUSPECT
+        self.is_suspect[row], self.is_tested[row] = is_suspect, closure.state == ACCEPTED
+        self.is_new[row] = is_suspect and closure.reason == NEW
 
     def suspects(self) -> I64:
         """Rows."""
@@ -137,11 +140,12 @@ class Ledger:
 
     def unjudged(self) -> I64:
         """Rows of those that nobody has looked at."""
-        return np.array([row for row in self.suspects().tolist() if self.closures[row].reason == NEW], np.int64)
+        return np.flatnonzero(self.is_new[: len(self.closures)])
 
     def older_suspects(self) -> I64:
         """Rows of the other suspects."""
-        return np.setdiff1d(self.suspects(), self.unjudged())
+        count = len(self.closures)
+        return np.flatnonzero(self.is_suspect[:count] & ~self.is_new[:count])
 
 
 class ClosureLedger:
@@ -154,6 +158,7 @@ class ClosureLedger:
         self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
         self.of_factor: dict[int, Closure] = {}
         self.looks = self.moved_at = 0
+        self._counts = dict.fromkeys(CLOSURE_STATES, 0)
 
     @property
     def closures(self) -> list[Closure]:
@@ -162,14 +167,14 @@ class ClosureLedger:
 
     def counts(self) -> dict[str, int]:
         """How many are in each state."""
-        states = [closure.state for closure in self.of_factor.values()]
-        return {state: states.count(state) for state in CLOSURE_STATES}
+        return dict(self._counts)
 
     def add(self, factor: FactorGroup, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
         """A new one: a suspect that nobody has looked at."""
         closure = Closure(factor_id, 0, factor, revision, changed=revision)
         self.of_kind[factor.kind].add(closure, [graph.find(key) for key in closure.keys], self.looks)
         self.of_factor[factor_id] = closure
+        self._counts[SUSPECT] += 1
         return closure
 
     def named(self, factors: Iterable[int]) -> list[Closure]:
@@ -207,6 +212,8 @@ class ClosureLedger:
             ledger.looked[c.row] = self.looks
             ledger.mark(c)
             if c.state != was[0]:
+                self._counts[was[0]] -= 1
+                self._counts[c.state] += 1
                 c.changed = revision
                 changed.append(c)
             moved = moved or c.is_in != was[1]
@@ -217,7 +224,7 @@ class ClosureLedger:
     def forget(self, gone: Iterable[int], graph: FactorGraph) -> None:
         """Those with these ids are no more, and variables of the map may have other numbers."""
         for factor in gone:
-            del self.of_factor[factor]
+            self._counts[self.of_factor.pop(factor).state] -= 1
         looked = {c.factor_id: int(self.of_kind[c.factor.kind].looked[c.row]) for c in self.of_factor.values()}
         self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
         for c in self.of_factor.values():
@@ -259,6 +266,7 @@ class ClosureLedger:
             closure = Closure(ids[0], 0, factor, ids[1], *told, ids[2], ids[3])
             self.of_kind[kind].add(closure, [graph.find(key) for key in closure.keys], int(state["looked"][k]))
             self.of_factor[closure.factor_id] = closure
+            self._counts[closure.state] += 1
 
 
 _TRIANGLES = {"between_se2": 6, "between_se3": 21}
