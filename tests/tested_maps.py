@@ -8,7 +8,7 @@ import numpy as np
 from factorbus.journal import chain
 from factorbus.journal.records import JournalRecord, Last
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE, Suspects, decode_suspects
+from factorbus.proto.closures import CLOSURE_STATES, JUDGE, Suspects, decode_suspects
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Arrived, Outcome, Refuse, Stepped, Verdict
@@ -56,7 +56,7 @@ class TestedMap:
 
     def insert(self, *contents: Batch, changes: tuple[Change, ...] = ()) -> list[Any]:
         """Into one record; the answers: of those that were refused the problem."""
-        inserts = [self._arrived(content, changes) for content in contents]
+        inserts = [self.arrived(content, changes) for content in contents]
         events, _ = self.solver.apply_whole(inserts)
         record = written(self.last.record + 1, inserts, events, self.last)
         self.records.append(record)
@@ -109,11 +109,15 @@ class TestedMap:
         columns += [(group.ids, group.measured, group.information) for group in factors]
         return [column.tobytes() for group in columns for column in group]
 
+    def check_counts(self) -> None:
+        states = list(self.states().values())
+        assert self.suspects().counts == {state: states.count(state) for state in CLOSURE_STATES}
+
     def judged(self) -> int:
         """Entries of the judge."""
         return sum(entry.client == JUDGE for record in self.records for entry in record.entries)
 
-    def _arrived(self, content: Batch, changes: tuple[Change, ...]) -> Arrived:
+    def arrived(self, content: Batch, changes: tuple[Change, ...] = ()) -> Arrived:
         self._number += 1
         message = codec.encode_insert(Insert(self._number, content, changes=changes))
         arrived = read_insert(None, "robot", message, Limits().message(), 0.0)

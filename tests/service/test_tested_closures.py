@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tested_maps import TestedMap, between, corridor, right
 
 from factorbus.journal.records import ACCEPTED, REFUSED
-from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, JUDGE, JudgedClosures, decode_judged
-from factorbus.proto.messages import Batch, Change, Variables
+from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, JUDGE, ClosureEntry, decode_closure_entry
+from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.service.core.events import Arrived, Verdict, refusal
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.closures import ledger
@@ -55,11 +55,25 @@ def test_verdicts_are_entries_behind_their_insert() -> None:
     made.insert(Batch((), (right(1, LENGTH),)), Batch((), (between(2, 15, [3.0, 0.0, 3.14]),)))
     entries = made.records[-1].entries
     assert [entry.client for entry in entries] == ["robot", JUDGE, "robot", JUDGE]
-    verdicts = [decode_judged(entry.message) for entry in entries if entry.client == JUDGE]
+    verdicts = [decode_closure_entry(entry.message) for entry in entries if entry.client == JUDGE]
     assert [(v.sequence, v.factors.tolist(), v.states) for v in verdicts] == [
         (1, [16], ("accepted",)),
         (2, [17], ("suspect",)),
     ]
+
+
+def test_suspects_are_looked_at_again_when_the_map_has_got_or_lost_closures() -> None:
+    made = driven(40)
+    for n in range(30):  # more than one look is at
+        made.insert(Batch((), (between(20 + n, 2, [9.0, 9.0, 1.0 + 0.01 * n]),)))
+    assert set(made.states().values()) == {"suspect"}
+    ledger_of = made.solver._ledger.of_kind["between_se2"]  # type: ignore[attr-defined]
+    before = ledger_of.looked[:30].copy()
+    assert before.max() == 30
+    for k in range(1, 20, 3):
+        made.insert(Batch((), (right(k, 40),)))
+    assert "accepted" in made.states().values()
+    assert (ledger_of.looked[:30] > before).all(), "each of them, a few at a time"
 
 
 def test_a_journal_is_run_again_by_its_verdicts_and_not_by_judging(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +145,8 @@ def test_trusted_factors_and_those_of_changes_are_not_tested() -> None:
 def test_poses_that_went_and_came_again_are_joined_anew() -> None:
     made = driven()
     made.change(Change("remove_variables", keys=ids(16)))
-    made.insert(Batch((Variables("se2", ids(16)),), (between(1, 16, [0.5, 0.0, 3.14]),)))
+    (accepted,) = made.insert(Batch((Variables("se2", ids(16)),), (between(1, 16, [0.5, 0.0, 3.14]),)))
+    assert accepted.first_factor == 16
     assert made.states() == {}, "nothing else joins it"
     made.kill()
 
@@ -214,6 +229,7 @@ def test_whatever_happens_ids_stay_and_the_journal_gives_the_same_bits(happened:
         states = made.states()
         out = {factor for factor, state_ in states.items() if state_ in ("suspect", "rejected")}
         assert not states.keys() & gone
+        made.check_counts()
         assert made.in_graph() == {factor: keys for factor, keys in made.ids.items() if factor not in gone | out}
     made.kill()
 
@@ -222,7 +238,45 @@ def test_an_entry_of_the_judge_is_what_it_was() -> None:
     made = driven()
     made.insert(Batch((), (right(1, LENGTH),)))
     entry = made.records[-1].entries[1]
-    again = decode_judged(entry.message)
-    assert isinstance(again, JudgedClosures)
+    again = decode_closure_entry(entry.message)
+    assert isinstance(again, ClosureEntry)
     assert (again.states, again.reasons, again.tried.tolist()) == (("accepted",), ("passed",), [-1])
     assert made.judged() == 1
+
+
+def test_many_closures_at_once_are_judged_in_several_looks() -> None:
+    made = driven(40)
+    factors = tuple(right(k, 40) for k in range(1, 40)) * 2
+    (accepted,) = made.insert(Batch((), factors))
+    assert (accepted.report["closures"], accepted.report["suspects"]) == (78, 0)
+    assert made.judged() == 2, "64 and the rest"
+    assert made.in_graph() == made.ids
+    made.kill()
+    made.kill(made.solver.dump(), len(made.records))
+
+
+def test_in_space_the_same() -> None:
+    made, triangle = TestedMap(), np.diag([2500.0] * 3 + [10_000.0] * 3)[np.triu_indices(6)][None]
+
+    def pose_between(i: int, j: int, x: float) -> Factors:
+        return Factors("between_se3", ids(i, j)[None], np.array([[x, 0.0, 0, 0, 0, 0, 1]]), triangle)
+
+    made.insert(Batch((Variables("se3", ids(0), np.array([[0.0] * 6 + [1.0]]), True),)))
+    for k in range(1, 9):
+        made.insert(Batch((Variables("se3", ids(k)),), (pose_between(k - 1, k, 1.0),)))
+    (accepted,) = made.insert(Batch((), (pose_between(2, 5, 3.0), pose_between(1, 7, 2.0))))
+    assert (accepted.report["closures"], accepted.report["suspects"]) == (2, 1)
+    assert made.states() == {8: "accepted", 9: "suspect"}
+    state = made.solver.dump()
+    made.change(Change("accept", ids(9)))
+    made.kill(state, len(made.records) - 1)
+
+
+def test_counts_are_there_whatever_came() -> None:
+    made = driven()
+    made.insert(Batch((), (right(1, LENGTH),)))
+    counts = {"accepted": 1, "suspect": 0, "rejected": 0, "restored": 0}
+    odometry = between(16, 17, [1.0, 0.0, 0.0])
+    for content in (Batch((), (odometry,)), Batch((Variables("se2", ids(17)),), (odometry,)), Batch()):
+        assert made.solver.apply_whole([made.arrived(content)])[1].closures == counts
+    assert made.solver.apply_whole([], further=True)[1].closures == counts

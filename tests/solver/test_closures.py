@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.solver import Options, errors
+from factorbus.solver import Options, Solver, errors
 from factorbus.solver.closures.choosing import largest_agreeing
 from factorbus.solver.closures.evidence import (
     ClosureNumbers,
@@ -25,6 +25,7 @@ from factorbus.solver.closures.evidence import (
 from factorbus.solver.closures.gated import GatedSolver
 from factorbus.solver.closures.judging import CONTRADICTED, closure_numbers
 from factorbus.solver.closures.ledger import ACCEPTED, REJECTED, RESTORED, SUSPECT, Closure, NotAClosure
+from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, tangent_of
 from factorbus.solver.closures.policy import ClosurePolicy
 
@@ -316,7 +317,7 @@ def test_a_policy_out_of_its_range_is_refused(settings_: dict[str, float]) -> No
         ClosurePolicy(**settings_)  # pyright: ignore[reportArgumentType]
 
 
-def test_accepted_ones_are_judged_against_the_map_without_them() -> None:
+def test_accepted_ones_are_entry_against_the_map_without_them() -> None:
     made = driven()
     for k in (1, 3, 5):
         made.insert(closure(k, 17 - k, [0.01 * k, 0.0, math.pi]))
@@ -346,3 +347,53 @@ def test_drives_with_false_closures_and_without() -> None:
         assert not (is_in & false).any()
         assert (is_in & ~false).sum() >= 0.98 * (~false).sum()
         assert twice[0] == twice[1]
+
+
+@given(joins=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)).filter(lambda ij: ij[0] != ij[1]), max_size=12))
+def test_what_hangs_together_is_kept_and_found_again_in_the_graph(joins: list[tuple[int, int]]) -> None:
+    """Against parts that are merged one by one."""
+    keys = np.arange(10) * 10  # none follows another
+    made, parts = TrustedForest(), {int(key): {int(key)} for key in keys}
+    solver = Solver(Options())
+    solver.stage(Batch((Variables("se2", keys, np.zeros((10, 3)), True),)))
+    solver.step()
+    for i, j in joins:
+        factors = closure(int(keys[i]), int(keys[j]), [1.0, 0.0, 0.0]).factors
+        split = made.split(Batch((), factors))
+        a, b = int(keys[i]), int(keys[j])
+        assert len(split.closing) == (b in parts[a])
+        for key in (merged := parts[a] | parts[b]):
+            parts[key] = merged
+        kept = TrustedForest()
+        kept.load(made.dump())
+        assert len(kept.split(Batch((), factors)).closing) == 1
+        made = kept
+    made.renew(solver.factor_graph)
+    assert all(
+        made.split(Batch((), closure(int(a), int(b), [0.0, 0.0, 0.0]).factors)).closing
+        for a, b in itertools.combinations(keys, 2)
+    ), "what is fixed is joined by the ground"
+
+
+def test_a_refused_split_leaves_nothing_joined() -> None:
+    made, batch = TrustedForest(), closure(1, 9, [1.0, 0.0, 0.0])
+    assert not made.split(batch).closing
+    made.forget()
+    assert not made.split(batch).closing
+    assert made.split(batch).closing
+
+
+def test_factors_are_found_by_ids_in_any_order() -> None:
+    made = driven()
+    for k in (1, 3, 5):
+        made.insert(closure(k, 17 - k, [0.0, 0.0, math.pi]))
+    made.reject(16)
+    made.insert(closure(6, 11, [0.0, 0.0, math.pi]))
+    made.accept(16)
+    graph = made.solver.factor_graph
+    assert graph.ids_of(np.arange(20)).tolist() == [*range(16), 17, 18, 19, 16]
+    assert graph.rows_of(np.array([16, 19, 0, 17, 20, 99])).tolist() == [19, 18, 0, 16, -1, -1]
+    (group,) = made.solver.graph()[1]
+    assert group.ids is not None
+    assert group.ids.tolist() == list(range(20))
+    assert group.keys[16:18].tolist() == [[1, 16], [3, 14]]

@@ -25,11 +25,11 @@ CLOSURE_REASONS = ("new", "passed", "agrees", "unsure", "improbable", "contradic
 
 
 @dataclass(frozen=True, slots=True)
-class JudgedClosures:
+class ClosureEntry:
     """An entry of a journal: what some closures are from now on.  factors (n,): ids; a state and a reason of each.
 
-    distance (n,): d²; chance (n,): of a false one to be within the gate; tried (n,): the newest rival at the last
-    trial, −1: none.
+    distance (n,): d²; chance (n,): the odds that it is false; tried (n,): the newest rival at the last trial, −1:
+    none.
     """
 
     sequence: int
@@ -54,7 +54,7 @@ class Suspects:
 
     policy: one of CLOSURE_POLICIES; with "trust" there are none.  counts: of all closures, by state.  factors (n,):
     ids; keys (n, 2): the poses they are between; kinds, states, reasons: of each.  distance (n,): d² and chance (n,):
-    of a false one to be within the gate, when it was last looked at, NaN before.  came, changed (n,): revisions, when
+    the odds that it is false, when it was last looked at, NaN before.  came, changed (n,): revisions, when
     it was inserted, and since when its state is this one.
     """
 
@@ -73,7 +73,7 @@ class Suspects:
     changed: I64 = field(default_factory=lambda: np.empty(0, np.int64))
 
 
-def encode_judged(message: JudgedClosures) -> bytes:
+def encode_closure_entry(message: ClosureEntry) -> bytes:
     """The bytes of an entry."""
     return encode_map(
         {
@@ -88,11 +88,11 @@ def encode_judged(message: JudgedClosures) -> bytes:
     )
 
 
-def decode_judged(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> JudgedClosures:
+def decode_closure_entry(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> ClosureEntry:
     """The entry that `data` is."""
-    content = fields.read_map("judged", data, limits)
+    content = fields.read_map("closure entry", data, limits)
     factors = _integers(content, "factors")
-    return JudgedClosures(
+    return ClosureEntry(
         fields.integer("", content, "sequence", least=1),
         factors,
         _texts(content, "states", factors.size, CLOSURE_STATES),

@@ -81,7 +81,9 @@ class Config:
     name: str = ""  # of this service, in its liveliness tokens; empty: made up
     maps: str = "*"
     create: tuple[str, ...] = ()
-    closures: str = "trust"  # of maps that are new here, unless whoever creates one says otherwise: trust or test
+    closures: str = (
+        "trust"  # of maps that are new here, unless the client that creates one says otherwise: trust or test
+    )
     zenoh: str = ""
     insecure: bool = False
     warm: bool = True  # compile every kernel before taking the first insert

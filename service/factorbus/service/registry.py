@@ -21,7 +21,7 @@ from factorbus.service.bus.zenoh_session import MapPlace, ServiceBus
 from factorbus.service.config import Config
 from factorbus.service.core.events import Asker, Read
 from factorbus.service.core.map_state import MapCore
-from factorbus.service.journal.library import CopiedAt, Kept, Library, closures_of, make_map_solver, restored
+from factorbus.service.journal.library import CopiedAt, Kept, Library, closure_policy_of, make_map_solver, restored
 from factorbus.service.maps.host import Host
 from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.process.heap import give_back
@@ -33,7 +33,7 @@ from factorbus.service.questions.admin import (
     MapExists,
     NotDamaged,
     NotHere,
-    check_same,
+    check_made_as,
     ours,
     settled_mode,
 )  # fmt: skip
@@ -161,7 +161,7 @@ class Maps:
         """The row of map `name`, made if it is not there.  mode: None, closures: "" for whichever.  Raises Problem."""
         if found := self._maps.get(name):
             core = found.host.core
-            check_same(name, (core.mode, core.closures), mode and settled_mode(mode), closures)
+            check_made_as(name, (core.mode, core.closures), mode and settled_mode(mode), closures)
             return core.row()
         if not ours(self._config.maps, keys.checked_name("map", name)):
             raise NotHere(name, self._config.maps)
@@ -298,8 +298,8 @@ class Maps:
         else:
             epoch, mode = secrets.randbits(62) | 1, mode or settled_mode("auto")
             made = make_map_solver(mode, {"closures": closures or self._config.closures}, epoch, limits)
-            return MapCore(name, mode, epoch, limits, now, closures_of(made.options())), made, None
-        core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now, closures_of(kept.header.options))
+            return MapCore(name, mode, epoch, limits, now, closure_policy_of(made.options())), made, None
+        core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now, closure_policy_of(kept.header.options))
         kept.restore(core)
         return core, kept.map_solver, kept
 

@@ -18,8 +18,8 @@ _SHOWN = 40  # more closures than these are listed with --json only
 def suspects_command(address: MapAddress, every: bool, as_json: bool) -> int:
     """Which loop closures the estimate does not have, why, and since which revision: of a map that tests them.
 
-    d² is how far off a closure is, squared, in standard deviations of what the map knows; chance, how likely a false
-    one would be as near. `factorbus change accept` and `reject` are the last word.
+    d² is how far off a closure is, squared, in standard deviations of what the map knows; chance, the odds that it
+    is false where every second one is. `factorbus change accept` and `reject` are the last word.
 
     \b
     factorbus ask suspects warehouse

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 from factorbus.proto.arrays import I64
-from factorbus.proto.closures import JudgedClosures
+from factorbus.proto.closures import ClosureEntry
 from factorbus.proto.interest_codec import AskInterest
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Problem, without_frames
@@ -61,7 +61,7 @@ class Arrived(NamedTuple):
     def is_change(self) -> bool:
         """Whether it changes what the map has, which is a step of its own."""
         content = self.content
-        return isinstance(content, JudgedClosures) or (isinstance(content, Insert) and bool(content.changes))
+        return isinstance(content, ClosureEntry) or (isinstance(content, Insert) and bool(content.changes))
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from factorbus.service.core.map_state import MapCore, Restored
 from factorbus.service.journal.checkpoint_plan import CheckpointPlan
 from factorbus.service.journal.keeping import Keeper, Listener
 from factorbus.service.journal.recovery import Recovered, answers, recover
-from factorbus.service.questions.admin import check_same
+from factorbus.service.questions.admin import check_made_as
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.tested import TestedMapSolver
 from factorbus.solver.build import present_build
@@ -59,7 +59,7 @@ def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: L
     return MapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict())
 
 
-def closures_of(options: Mapping[str, Any]) -> str:
+def closure_policy_of(options: Mapping[str, Any]) -> str:
     """What becomes of loop closures in a map with these settings."""
     return str(options.get("closures", "trust"))
 
@@ -129,7 +129,7 @@ class Library:
         try:
             store.check_form()
             header = store.header()
-            check_same(name, (header.mode, closures_of(header.options)), mode, closures)
+            check_made_as(name, (header.mode, closure_policy_of(header.options)), mode, closures)
             return _reopened(store, header, limits, self._config)
         except Problem:
             store.close()

@@ -140,7 +140,7 @@ def read_fork(payload: bytes) -> Fork:
     return Fork(_map_name(content, "fork"), _map_name(content, "fork", "as"), request)
 
 
-def check_same(name: str, made_as: tuple[str, str], mode: str | None, closures: str) -> None:
+def check_made_as(name: str, made_as: tuple[str, str], mode: str | None, closures: str) -> None:
     """Is map `name`, of that mode and policy, as it is asked for?  None, "": whichever.
 
     Raises OtherMode, OtherClosures.

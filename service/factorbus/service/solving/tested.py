@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE, JudgedClosures, Suspects, encode_judged, encode_suspects
+from factorbus.proto.closures import JUDGE, ClosureEntry, Suspects, encode_closure_entry, encode_suspects
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Batch, Change, Insert
 from factorbus.proto.problems import Internal, Problem
@@ -72,7 +72,8 @@ class TestedMapSolver(MapSolver):
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        self._ledger, self._forest, self._entries = ClosureLedger(), TrustedForest(), 0
+        self._ledger, self._forest = ClosureLedger(), TrustedForest()
+        self._entries = 0  # verdicts that were entered since
 
     # ---- as of any map solver ---------------------------------------------------------------------------------------
 
@@ -112,7 +113,7 @@ class TestedMapSolver(MapSolver):
                 continue
             yield from self._add_plain(plain)
             plain = []
-            if isinstance(insert.content, JudgedClosures):
+            if isinstance(insert.content, ClosureEntry):
                 yield from self._apply_judged(insert, insert.content)
             elif batch is not None:
                 yield from self._insert_tested(insert, batch)
@@ -123,8 +124,7 @@ class TestedMapSolver(MapSolver):
 
     def dump(self) -> dict[str, Any]:
         """With what became of closures."""
-        own = {"ledger": self._ledger.dump(), "forest": self._forest.dump(), "entries": self._entries}
-        return super().dump() | {"closures": own}
+        return super().dump() | {"closures": {"ledger": self._ledger.dump(), "forest": self._forest.dump()}}
 
     def load(self, state: Mapping[str, Any] | None) -> bool:
         """With what became of closures."""
@@ -134,7 +134,6 @@ class TestedMapSolver(MapSolver):
             own = state["closures"]
             self._ledger.load(own["ledger"], self._solver.factor_graph)
             self._forest.load(own["forest"])
-            self._entries = int(own["entries"])
         return same
 
     def closure_counts(self) -> dict[str, int]:
@@ -177,7 +176,7 @@ class TestedMapSolver(MapSolver):
                 for outcome in event.outcomes:
                     if outcome.first_factor >= 0 and (batch := _batch_of(outcome.insert)) is not None:
                         self._forest.join(batch)
-            yield event
+            yield event._replace(closures=self._ledger.counts()) if isinstance(event, Applied) else event
 
     def _insert_tested(self, insert: Arrived, batch: Batch) -> Iterator[Verdict | Stepped]:
         """One that may have closures."""
@@ -186,6 +185,7 @@ class TestedMapSolver(MapSolver):
         try:
             if split.closing and not self._broken:
                 self._check_room(self._accepted_counts, batch.variable_count, batch.factor_count)
+                self._solver.check_new_kinds(batch)
                 check_whole(self._solver.factor_graph, batch)
         except (Problem, SolverError) as problem:
             self._forest.forget()
@@ -225,29 +225,37 @@ class TestedMapSolver(MapSolver):
     def _judged(self, kinds: Iterable[str]) -> Iterator[Verdict | Stepped]:
         """The judge looks at the new closures of these kinds, and what it says is applied."""
         for kind in kinds:
-            for look in (self._judge.look, self._judge.look_back):
-                try:
-                    verdicts = look(self._solver, self._ledger, kind)
-                except SolverError as problem:
-                    log.warning("closures are not judged, and stay as they are: %s", problem)
-                    return
-                except Exception:
-                    log.exception("closures are not judged, and stay as they are: the judge failed")
-                    return
-                if verdicts is not None and not (yield from self._enter(verdicts)):
-                    yield from self._enter(self._ledger.failed(verdicts))
+            while (verdicts := self._looked(self._judge.look, kind)) is not None:
+                yield from self._enter_or_keep(verdicts)
+            if (verdicts := self._looked(self._judge.look_back, kind)) is not None:
+                yield from self._enter_or_keep(verdicts)
+
+    def _looked(self, look: Callable[..., ClosureVerdicts | None], kind: str) -> ClosureVerdicts | None:
+        """What the judge says; None: nothing, or it failed."""
+        try:
+            return look(self._solver, self._ledger, kind)
+        except SolverError as problem:
+            log.warning("closures are not judged, and stay as they are: %s", problem)
+        except Exception:
+            log.exception("closures are not judged, and stay as they are: the judge failed")
+        return None
+
+    def _enter_or_keep(self, verdicts: ClosureVerdicts) -> Iterator[Verdict | Stepped]:
+        """Apply them; where their step fails, what was to go in are suspects."""
+        if not (yield from self._enter(verdicts)):
+            yield from self._enter(self._ledger.failed(verdicts))
 
     def _enter(self, verdicts: ClosureVerdicts) -> Generator[Verdict | Stepped, None, bool]:
         """Apply them as an entry that comes behind the insert; gives whether they are."""
-        content = JudgedClosures(self._entries + 1, *verdicts)
-        message = encode_judged(content)
-        return (yield from self._apply_judged(judged_again(message, content), content))
+        self._entries += 1
+        content = ClosureEntry(self._entries, *verdicts)
+        message = encode_closure_entry(content)
+        return (yield from self._apply_judged(entry_again(message, content), content))
 
-    def _apply_judged(self, insert: Arrived, content: JudgedClosures) -> Generator[Verdict | Stepped, None, bool]:
-        self._entries = content.sequence
+    def _apply_judged(self, insert: Arrived, content: ClosureEntry) -> Generator[Verdict | Stepped, None, bool]:
         verdicts = ClosureVerdicts(*(getattr(content, name) for name in ClosureVerdicts._fields))
         try:
-            switch = planned_switch(self._solver.factor_graph, self._ledger, verdicts)
+            switch = planned_switch(self._ledger, verdicts)
         except SolverError as problem:
             yield Verdict((refusal(insert, problem),))
             return False
@@ -334,14 +342,14 @@ class TestedMapSolver(MapSolver):
                 left.append(change._replace(factors=np.array([i for i in ids if i not in gone])) if out else change)
         verdicts = _together(said)
         _check_once("accept, reject and remove_factors", [*verdicts.factors.tolist(), *gone])
-        switch = planned_switch(self._solver.factor_graph, self._ledger, verdicts)
+        switch = planned_switch(self._ledger, verdicts)
         removals = [Change("remove_factors", removal.factors) for removal in switch.removals]
         batch: Any = content.batch._replace(factors=(*content.batch.factors, *switch.additions))
         made = content._replace(batch=batch, changes=(*removals, *left))
         return _Asked(insert._replace(content=made), verdicts, switch, gone)
 
 
-def judged_again(message: bytes, content: JudgedClosures) -> Arrived:
+def entry_again(message: bytes, content: ClosureEntry) -> Arrived:
     """Verdicts as an entry, which nobody waits for."""
     return Arrived([], JUDGE, content.sequence, 0, len(message), int(digest(message)), content, 0.0, message)
 

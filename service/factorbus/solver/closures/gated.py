@@ -7,6 +7,7 @@
 All of it follows from what was inserted: the same batches give the same verdicts, and the same bits.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from factorbus.solver.changing import try_change, with_changes
@@ -83,11 +84,10 @@ class GatedSolver:
         """The closures of a batch are written down and judged, now that the rest of it is in."""
         new, moved = enter_closures(self.solver, self.ledger, staged, self._steps), dict[int, bool]()
         for kind in dict.fromkeys(c.factor.kind for c in new):
-            for look in (self.judge.look, self.judge.look_back):
-                if (verdicts := look(self.solver, self.ledger, kind)) is not None:
-                    for c in self.ledger.named(verdicts.factors.tolist()):
-                        moved.setdefault(c.factor_id, c.is_in)
-                    report = self._apply_or_keep(verdicts) or report
+            for verdicts in self._looks(kind):
+                for c in self.ledger.named(verdicts.factors.tolist()):
+                    moved.setdefault(c.factor_id, c.is_in)
+                report = self._apply_or_keep(verdicts) or report
         if not moved:
             return GatedReport(report, tuple(c for c in new if c.is_in), tuple(c for c in new if not c.is_in))
         for c in new:
@@ -99,6 +99,13 @@ class GatedSolver:
             tuple(c for c in new if not c.is_in),
             tuple(c for c in changed if not c.is_in),
         )
+
+    def _looks(self, kind: str) -> Iterator[ClosureVerdicts]:
+        """What the judge says, each once that before is applied."""
+        while (verdicts := self.judge.look(self.solver, self.ledger, kind)) is not None:
+            yield verdicts
+        if (verdicts := self.judge.look_back(self.solver, self.ledger, kind)) is not None:
+            yield verdicts
 
     def suspects(self) -> list[Closure]:
         """Closures that the estimate does not have, and that may still be believed."""
@@ -121,7 +128,7 @@ class GatedSolver:
 
     def _apply(self, verdicts: ClosureVerdicts) -> StepReport | None:
         """Make the step that verdicts ask for, if any; None: nothing goes in or out."""
-        switch = planned_switch(self.solver._graph, self.ledger, verdicts)
+        switch = planned_switch(self.ledger, verdicts)
         following, report = self.solver._graph.next_id, None
         if switch.out:
             batch = Addition((), switch.additions)

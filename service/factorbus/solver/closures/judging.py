@@ -57,6 +57,7 @@ _NEWEST = 40  # suspects, or accepted ones, among which places are looked for
 _BELIEVED = {PASSED, AGREES}
 _PLANE_DIM, _SPACE_DIM = 3, 6
 _WORST = 4  # accepted ones whose d² is computed in a step
+_TOGETHER = 64  # new closures that are judged together: each two of them are compared
 _RETRY = 2  # rivals that have to be new before the same closures are tried again
 
 _Row: TypeAlias = tuple[Closure, str, str, float, float, int]
@@ -70,11 +71,14 @@ class ClosureJudge:
         self.limits = {dims: limits_of(self.policy, dims) for dims in (_PLANE_DIM, _SPACE_DIM)}
 
     def look(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
-        """Judge new ones of a kind, and suspects that may be believed now; None: none is.  Raises SolverError."""
+        """Judge new ones of a kind, the oldest where there are many, and after a look that moved any, or with new ones,
+        suspects that may be believed now; None: there are none.  Raises SolverError.
+        """
         ledger = ledgers.of_kind[kind]
-        if not ledger.is_suspect[: len(ledger.closures)].any():
+        new = ledger.unjudged()[:_TOGETHER]
+        if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: len(ledger.closures)].any():
             return None
-        looked_at, settled = self._revisited(solver, ledgers, ledger, ledger.unjudged())
+        looked_at, settled = self._revisited(solver, ledgers, ledger, new)
         alone = [_as_suspect(ledger.closures[row], IMPROBABLE) for row in settled.tolist()]
         if not looked_at.size:
             return verdicts_of(alone) if alone else None
@@ -134,8 +138,8 @@ class ClosureJudge:
         longest.
         """
         most, out, settled, picked = self.policy.closure_revisits, self.limits[ledger.dim].out, new[:0], new
-        others = ledger.is_suspect[: len(ledger.closures)].copy()
-        others[new] = False
+        count = len(ledger.closures)
+        others = ledger.is_suspect[:count] & ~ledger.is_new[:count]
         if new.size:
             among = np.flatnonzero(others)[-4 * _NEWEST :]
             is_improbable = ledger.is_improbable[among]

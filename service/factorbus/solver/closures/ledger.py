@@ -21,7 +21,7 @@ ACCEPTED, SUSPECT, REJECTED, RESTORED = "accepted", "suspect", "rejected", "rest
 CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
-_BELIEVED = {ACCEPTED, RESTORED}
+BELIEVED = {ACCEPTED, RESTORED}
 _COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_new", "is_tested", "is_improbable")
 
 
@@ -48,7 +48,7 @@ class Closure:
     @property
     def is_in(self) -> bool:
         """Whether the estimate has it."""
-        return self.state in _BELIEVED
+        return self.state in BELIEVED
 
     @property
     def keys(self) -> tuple[int, int]:
@@ -188,6 +188,7 @@ class ClosureLedger:
         self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
         self.of_factor: dict[int, Closure] = {}
         self.looks = self.moved_at = 0
+        self._counts = dict.fromkeys(CLOSURE_STATES, 0)
 
     @property
     def closures(self) -> list[Closure]:
@@ -196,20 +197,22 @@ class ClosureLedger:
 
     def counts(self) -> dict[str, int]:
         """How many are in each state."""
-        states = [closure.state for closure in self.of_factor.values()]
-        return {state: states.count(state) for state in CLOSURE_STATES}
+        return dict(self._counts)
 
     def add(self, factor: FactorGroup, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
         """A new one: a suspect that nobody has looked at."""
         closure = Closure(factor_id, 0, factor, revision, changed=revision)
         self.of_kind[factor.kind].add(closure, [graph.find(key) for key in closure.keys], self.looks)
         self.of_factor[factor_id] = closure
+        self._counts[SUSPECT] += 1
         return closure
 
     def enter(self, kind: str, new: Sequence[Closure], ends: I64, z: F64, noise: F64, bound: F64) -> None:
         """New ones of a kind, with their columns."""
         self.of_kind[kind].enter(new, ends, self.looks, z, noise, bound)
         self.of_factor |= {closure.factor_id: closure for closure in new}
+        for closure in new:
+            self._counts[closure.state] += 1
 
     def named(self, factors: Iterable[int]) -> list[Closure]:
         """Those with these ids.  Raises NotAClosure."""
@@ -230,7 +233,7 @@ class ClosureLedger:
         rows = []
         for k, c in enumerate(self.named(verdicts.factors.tolist())):
             state, reason = verdicts.states[k], verdicts.reasons[k]
-            if (state in _BELIEVED) != c.is_in:
+            if (state in BELIEVED) != c.is_in:
                 state, reason = (c.state, c.reason) if c.is_in else (SUSPECT, FAILED)
             rows.append((c, state, reason, verdicts.distance[k], verdicts.chance[k], int(verdicts.tried[k])))
         return verdicts_of(rows)
@@ -246,6 +249,8 @@ class ClosureLedger:
             ledger.looked[c.row] = self.looks
             ledger.mark(c)
             if c.state != was[0]:
+                self._counts[was[0]] -= 1
+                self._counts[c.state] += 1
                 c.changed = revision
                 changed.append(c)
             moved, lost = moved or c.is_in != was[1], lost or (was[1] and not c.is_in)
@@ -258,7 +263,7 @@ class ClosureLedger:
     def forget(self, gone: Iterable[int], graph: FactorGraph) -> None:
         """Those with these ids are no more, and variables of the map may have other numbers."""
         for factor in gone:
-            del self.of_factor[factor]
+            self._counts[self.of_factor.pop(factor).state] -= 1
         looked = {c.factor_id: int(self.of_kind[c.factor.kind].looked[c.row]) for c in self.of_factor.values()}
         self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
         for c in self.of_factor.values():
@@ -300,6 +305,7 @@ class ClosureLedger:
             closure = Closure(ids[0], 0, factor, ids[1], *told, ids[2], ids[3])
             self.of_kind[kind].add(closure, [graph.find(key) for key in closure.keys], int(state["looked"][k]))
             self.of_factor[closure.factor_id] = closure
+            self._counts[closure.state] += 1
 
 
 _TRIANGLES = {"between_se2": 6, "between_se3": 21}

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.solver.changing import try_change, with_changes
-from factorbus.solver.closures.ledger import Closure, ClosureLedger, ClosureVerdicts
+from factorbus.solver.closures.ledger import BELIEVED, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.closures.loops import SplitFactors
 from factorbus.solver.divergence import copied
 from factorbus.solver.graph.admission import admit
@@ -24,15 +24,15 @@ from factorbus.solver.solver import Solver
 
 
 class ClosureSwitch(NamedTuple):
-    """What verdicts ask of a map.  out: closures that go, with the factors that they are in it; into: that come."""
+    """What verdicts ask of a map.  out: closures that go; into: that come."""
 
-    out: tuple[tuple[Closure, FactorGroup], ...]
+    out: tuple[Closure, ...]
     into: tuple[Closure, ...]
 
     @property
     def removals(self) -> list["FactorsRemoved"]:
         """The change that takes out what goes."""
-        return [FactorsRemoved(np.array([c.factor_id for c, _ in self.out]))] if self.out else []
+        return [FactorsRemoved(np.array([c.factor_id for c in self.out]))] if self.out else []
 
     @property
     def additions(self) -> list[FactorGroup]:
@@ -56,13 +56,13 @@ class FactorsRemoved:
     carry: bool = False
 
 
-def planned_switch(graph: FactorGraph, ledger: ClosureLedger, verdicts: ClosureVerdicts) -> ClosureSwitch:
+def planned_switch(ledger: ClosureLedger, verdicts: ClosureVerdicts) -> ClosureSwitch:
     """What `verdicts` ask of a map.  Raises NotAClosure."""
     out, into = [], []
     for c, state in zip(ledger.named(verdicts.factors.tolist()), verdicts.states, strict=True):
-        believed = state in ("accepted", "restored")
+        believed = state in BELIEVED
         if c.is_in and not believed:
-            out.append((c, graph.factor_named(c.factor_id)))
+            out.append(c)
         elif believed and not c.is_in:
             into.append(c)
     return ClosureSwitch(tuple(out), tuple(into))
@@ -82,8 +82,6 @@ def note_switch(
     """
     if switch.into:
         graph.rename_last(np.array([c.factor_id for c in switch.into]), following)
-    for c, factor in switch.out:
-        ledger.of_kind[factor.kind].measure(c, factor)
     return ledger.note(verdicts, revision)
 
 
