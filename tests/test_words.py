@@ -15,7 +15,7 @@ SOURCES = ("proto", "service", "clients", "workers")
 NAME_PARTS = (
     "errand", "courier", "ticket", "promise", "desk", "seat", "vitals", "lender", "doubt", "fold", "folds", "folded",
     "lookout", "polite", "discreet", "slip", "strain", "ripen", "ripe", "lacking", "sightseeing", "gauges", "whoever",
-    "sight", "sights", "sighted", "sighting", "sightings", "border", "borders", "account", "accounts", "closure_entry",
+    "sight", "sights", "sighted", "sighting", "sightings", "border", "borders", "account", "accounts", "judged",
     "grown", "burden", "dearness", "glide",
 )  # fmt: skip
 NAMES = ("Folder", "Run", "Alone", "Judged", "Located", "Lane", "Trips", "Shares", "Lent", "Memories", "take_in",

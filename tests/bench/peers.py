@@ -194,7 +194,7 @@ def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[d
     return {
         "machine": runner.machine(),
         "notes": said,
-        "closure_entry": plan.judged,
+        "judged": plan.judged,
         "rows": rows,
         "growth": growth,
         "cores": found["cores"],

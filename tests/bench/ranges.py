@@ -73,7 +73,7 @@ def driven(name: str, steps: int | None, every: int) -> list[dict[str, Any]]:
     optima = {start: gtsam_optimum(graph, _begun(graph, values)) for start, values in starts.items()}
     best = min(optima.values())
     own = {
-        "chi2_ratio": round(ratio, 6), "closure_entry": judged, "unconverged": count - judged, "chi2": round(chi2, 6),
+        "chi2_ratio": round(ratio, 6), "judged": judged, "unconverged": count - judged, "chi2": round(chi2, 6),
         "optima": {start: round(chi2, 6) for start, chi2 in optima.items()},
         "optimum_off": float(f"{(chi2 - best) / best:.2g}"),
         "entered": [[each.step, each.ranges, round(min(each.clear, 1e9), 1)] for each in feed.entered],

@@ -126,7 +126,7 @@ def test_an_estimate_that_lacks_a_variable_or_has_one_too_many_is_refused() -> N
 
 def test_the_optimum_of_a_full_settle_is_met_and_all_targets_with_it() -> None:
     found = row("manhattan", 150, Options(mode="all-batch", batch_tolerance=1e-12))
-    assert found["steps"] == found["closure_entry"] == 150
+    assert found["steps"] == found["judged"] == 150
     assert (found["unconverged"], found["above_1_001"]) == (0, 0)
     assert verdicts_of([found]) == dict.fromkeys(verdicts_of([found]), MET)
 
@@ -263,7 +263,7 @@ def test_isam2_goes_through_by_qr_where_cholesky_gives_up_and_it_is_said() -> No
 def test_drives_of_a_world_are_judged_together() -> None:
     rows = [row("manhattan", 60, Options(), seed) for seed in (1, 2)]
     both = together(rows)
-    assert (both["drives"], both["steps"], both["closure_entry"]) == (2, 120, 120)
+    assert (both["drives"], both["steps"], both["judged"]) == (2, 120, 120)
     assert both["max"] == max(each["max"] for each in rows)
     assert {each.verdict for each in judge([row("drift", 40, Options())]) if "ordinary" in each.what} == {NOT_MEASURED}
     assert tables.line(both).startswith("manhattan")

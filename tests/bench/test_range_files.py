@@ -57,7 +57,7 @@ def test_a_drive_that_knows_no_beacon_finds_all_of_them_and_ends_at_gtsam_s_opti
     ours, theirs = driven("goats_16", None, 100)
     assert ours["chi2_ratio"] <= WORST
     assert ours["unconverged"] == 0
-    assert ours["closure_entry"] == ours["steps"] == theirs["steps"]
+    assert ours["judged"] == ours["steps"] == theirs["steps"]
     assert abs(ours["optimum_off"]) <= 1e-6
     assert len(ours["entered"]) == 4
     assert not ours["waiting"]

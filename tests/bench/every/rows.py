@@ -22,7 +22,7 @@ def row_of(world: str, seed: int, steps: int, found: Followed, isam2: tuple[list
         "world": world,
         "seed": seed,
         "steps": steps,
-        "closure_entry": len(looks),
+        "judged": len(looks),
         **spread([look.ratio for look in looks]),
         "unconverged": sum(not seen.report.converged for seen in found.seen),
         "worst_converged": worst_converged([*found.seen, *found.idle]),
@@ -48,7 +48,7 @@ def row_of(world: str, seed: int, steps: int, found: Followed, isam2: tuple[list
 def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """All drives of a world as one row."""
     ratios = [ratio for row in rows for ratio in row["ratios"]]
-    sums = {name: sum(row[name] for row in rows) for name in ("steps", "closure_entry", "unconverged", "steps_s")}
+    sums = {name: sum(row[name] for row in rows) for name in ("steps", "judged", "unconverged", "steps_s")}
     most = ("worst_converged", "odometry_excess", "chi2_untrue", "idle_steps", "idle_s", "idle_ratio", "oracle_off")
     found = {
         "world": rows[0]["world"],

@@ -18,7 +18,7 @@ def report(document: dict[str, Any], verdicts: Sequence[Verdict]) -> str:
         *(f"> {note}" for note in document["notes"]),
     ]
     if rows:
-        parts += ["## Replays", main_table(rows, document["closure_entry"]), _LEGEND, "## Each data set"]
+        parts += ["## Replays", main_table(rows, document["judged"]), _LEGEND, "## Each data set"]
         for dataset in dict.fromkeys(row["dataset"] for row in rows):
             mine = [row for row in rows if row["dataset"] == dataset]
             parts += [f"### {mine[0]['title']}: {mine[0]['steps']} steps", details(mine)]
