@@ -14,7 +14,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.service.core.events import Arrived, Verdict, refusal
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.closures import ledger
-from factorbus.solver.closures.judging import ClosureJudge
+from factorbus.solver.closures.judging import ClosureJudge, residuals_weighed
 from factorbus.solver.errors import NotFinite
 
 LENGTH = 8
@@ -73,6 +73,12 @@ def test_suspects_are_looked_at_again_when_the_map_has_got_or_lost_closures() ->
     for k in range(1, 20, 3):
         made.insert(Batch((), (right(k, 40),)))
     assert "accepted" in made.states().values()
+    left = ledger_of.looked[:30] <= before
+    most_likely = residuals_weighed(made.solver._solver, ledger_of, np.arange(30))  # type: ignore[attr-defined]
+    assert (most_likely[left] > ClosureJudge().limits[3].out).all(), "but for those that cannot be believed"
+    assert made.change(Change("reject", ids(next(k for k, state in made.states().items() if state == "accepted"))))
+    for k in (2, 5, 8, 11, 14):
+        made.insert(Batch((), (right(k, 40),)))
     assert (ledger_of.looked[:30] > before).all(), "each of them, a few at a time"
 
 
