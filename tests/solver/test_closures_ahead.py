@@ -86,7 +86,7 @@ def test_before_the_step_a_closure_is_judged_as_after_it(new: int, partner: int)
     ledgers.add(split.closing[0], first + new, solver._graph, 0)
     numbers = closure_numbers(solver, ledgers.of_kind["between_se2"], np.array([0]))
     after = judge_each(numbers, [_SPREAD])
-    judged = foreseen.judged[0]
+    judged = foreseen.numbers[0]
     np.testing.assert_allclose(judged[J_ALLOWED:J_NOISE], after.allowed[0], rtol=5e-3, atol=1e-5)
     np.testing.assert_allclose(judged[J_NOISE : J_NOISE + 3], numbers.noise[0], rtol=1e-9)
     np.testing.assert_allclose(judged[J_MEASURED:], numbers.z[0], rtol=1e-12)

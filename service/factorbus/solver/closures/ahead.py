@@ -29,7 +29,7 @@ _PLANE = "between_se2"
 class Foreseen(NamedTuple):
     """What the map expects of some closures: their judgements as `judge_ahead` has them, and d² and odds of each."""
 
-    judged: F64
+    numbers: F64
     ends: I64
     distance: list[float]
     chance: list[float]
@@ -91,15 +91,15 @@ def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, 
     if any(staged.believed):
         ledgers.looks += 1
         ledgers.moved_at = ledgers.looks
-    made, bounds = list[Closure](), seen.judged[:, ahead.J_BOUND : ahead.J_MEASURED]
+    made, bounds = list[Closure](), seen.numbers[:, ahead.J_BOUND : ahead.J_MEASURED]
     if not all(staged.believed):
         out = ~np.array(staged.believed)
-        bounds[out] = np.linalg.inv(seen.judged[out, ahead.J_ALLOWED : ahead.J_NOISE])
+        bounds[out] = np.linalg.inv(seen.numbers[out, ahead.J_ALLOWED : ahead.J_NOISE])
     for k, place in enumerate(split.closing_at.tolist()):
         state, reason = (ACCEPTED, PASSED) if staged.believed[k] else (SUSPECT, NEW)
         told = state, reason, seen.distance[k], seen.chance[k], revision
         made.append(Closure(first + place, 0, split.closing[k], revision, *told))
-    z, noise = seen.judged[:, ahead.J_MEASURED :], seen.judged[:, ahead.J_NOISE : ahead.J_WEIGHT]
+    z, noise = seen.numbers[:, ahead.J_MEASURED :], seen.numbers[:, ahead.J_NOISE : ahead.J_WEIGHT]
     ledgers.enter(_PLANE, made, seen.ends, z, noise, bounds)
     return made
 
@@ -115,10 +115,10 @@ def _foresee(solver: Solver, split: SplitFactors, closing: I64, before: Mark, vo
             return None
     free, ends, moved = np.empty(2 * n, np.int64), np.empty((2 * n, 2), np.int64), np.empty((2 * n, ahead.MOVED))
     table = graph.array_table
-    count = ahead.list_ends(before[at.VARIABLES], before[at.FACTORS], closing, table, free, ends, moved)
+    count = ahead.list_closure_ends(before[at.VARIABLES], before[at.FACTORS], closing, table, free, ends, moved)
     if count < 0 or (known := solver.covariances.try_joint(free[:count])) is None:
         return None
-    judged = np.empty((n, ahead.J_SIZE, 3))
-    ahead.judge_ahead(closing, table, ends, moved, known, judged)
-    chance = [min(right / volume, 1.0) for right in judged[:, 0, 1].tolist()]
-    return Foreseen(judged, graph.fac[closing, at.F_I : at.F_J + 1], judged[:, 0, 0].tolist(), chance)
+    numbers = np.empty((n, ahead.J_SIZE, 3))
+    ahead.judge_ahead(closing, table, ends, moved, known, numbers)
+    chance = [min(right / volume, 1.0) for right in numbers[:, 0, 1].tolist()]
+    return Foreseen(numbers, graph.fac[closing, at.F_I : at.F_J + 1], numbers[:, 0, 0].tolist(), chance)

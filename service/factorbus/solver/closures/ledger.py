@@ -188,7 +188,7 @@ class ClosureLedger:
         self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
         self.of_factor: dict[int, Closure] = {}
         self.looks = self.moved_at = 0
-        self._counts: dict[str, int] = {state: 0 for state in CLOSURE_STATES}
+        self._counts: dict[str, int] = dict.fromkeys(CLOSURE_STATES, 0)
 
     @property
     def closures(self) -> list[Closure]:

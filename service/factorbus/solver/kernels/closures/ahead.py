@@ -15,12 +15,12 @@ import numpy as np
 from factorbus.solver.kernels.closures.plane import (
     Motion,
     add_predicted,
-    composed,
     inverse_of,
     motion_at,
+    motion_product,
     motion_to,
     put_adjoint,
-    weigh,
+    weigh_motion,
 )
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
@@ -32,7 +32,7 @@ J_DISTANCE, J_ALLOWED, J_NOISE, J_WEIGHT, J_BOUND, J_MEASURED, J_SIZE = 0, 1, 4,
 
 
 @kernel("int64(int64, int64, int64[::1], int64[::1], int64[::1], int64[:,::1], float64[:,::1])")
-def list_ends(v0: int, f0: int, closing: I64, graph_table: I64, free: I64, ends: I64, moved: F64) -> int:
+def list_closure_ends(v0: int, f0: int, closing: I64, graph_table: I64, free: I64, ends: I64, moved: F64) -> int:
     """Where the ends of closures lead back to; gives how many free poses those are, −1: it is not by odometry alone.
 
     in   v0, f0: variables and factors that the last step had  closing (n,): rows of factors, ascending
@@ -54,7 +54,7 @@ def list_ends(v0: int, f0: int, closing: I64, graph_table: I64, free: I64, ends:
         if i >= v0 and base[i - v0] < 0:
             return -1
         base[j - v0] = i if i < v0 else base[i - v0]
-        follow(motion[new if i < v0 else i - v0], payload, fac[f, at.F_AT], motion[j - v0])
+        follow_odometry(motion[new if i < v0 else i - v0], payload, fac[f, at.F_AT], motion[j - v0])
         placed += 1
     if placed != new:
         return -1
@@ -80,10 +80,10 @@ def list_ends(v0: int, f0: int, closing: I64, graph_table: I64, free: I64, ends:
 
 
 @inline_kernel
-def follow(before: F64, payload: F64, p: int, after: F64) -> None:
+def follow_odometry(before: F64, payload: F64, p: int, after: F64) -> None:
     """after = before and the relative pose that is measured at p of the payload."""
     z = payload[p], payload[p + 1], math.cos(payload[p + 2]), math.sin(payload[p + 2])
-    T = composed((before[0], before[1], before[2], before[3]), z)
+    T = motion_product((before[0], before[1], before[2], before[3]), z)
     after[0], after[1], after[2], after[3] = T
     A, Q = np.empty((3, 3)), np.zeros((3, 3))
     put_adjoint(inverse_of(z), 1.0, 0, A)
@@ -113,7 +113,7 @@ def put_certainty(payload: F64, p: int, noise: F64, weight: F64) -> None:
 def judge_ahead(closing: I64, graph_table: I64, ends: I64, moved: F64, known: F64, out: F64) -> None:
     """Closures in the rows `closing` against what the map expects, as `judge_each_plane` does.
 
-    in   ends, moved: of `list_ends`  known: the joint covariance of its `free`
+    in   ends, moved: of `list_closure_ends`  known: the joint covariance of its `free`
     out  (n, J_SIZE, 3): d² and v;  S;  Ω⁻¹;  Ω;  Ω S Ω = (Ω⁻¹ − J Σ₊ Jᵀ)⁻¹ with Σ₊ as it is when the closure is in;
          what was measured, as a matrix
     """
@@ -127,8 +127,8 @@ def judge_ahead(closing: I64, graph_table: I64, ends: I64, moved: F64, known: F6
         put_motion(z, own[J_MEASURED:])
         first, second = moved[2 * k], moved[2 * k + 1]
         T_a, T_b = (first[0], first[1], first[2], first[3]), (second[0], second[1], second[2], second[3])
-        a = composed(pose_of(values, var[ends[2 * k, END_BASE], at.V_AT]), T_a)
-        b = composed(pose_of(values, var[ends[2 * k + 1, END_BASE], at.V_AT]), T_b)
+        a = motion_product(pose_of(values, var[ends[2 * k, END_BASE], at.V_AT]), T_a)
+        b = motion_product(pose_of(values, var[ends[2 * k + 1, END_BASE], at.V_AT]), T_b)
         there = motion_to(a, b)
         # By what odometry adds to both ends, then by the poses that they follow from.
         put_adjoint(inverse_of(there), -1.0, 0, J)
@@ -143,7 +143,7 @@ def judge_ahead(closing: I64, graph_table: I64, ends: I64, moved: F64, known: F6
             row, column = ends[2 * k + m // 2, END_PLACE], ends[2 * k + m % 2, END_PLACE]
             if row >= 0 and column >= 0:
                 add_predicted(B, 3 * (m // 2), 3 * row, 3 * (m % 2), 3 * column, known, P)
-        weigh(motion_to(z, there), P, own[J_NOISE : J_NOISE + 3], own)
+        weigh_motion(motion_to(z, there), P, own[J_NOISE : J_NOISE + 3], own)
         for r in range(3):
             for c in range(3):
                 own[J_BOUND + r, c] = 0.0
@@ -178,8 +178,8 @@ def list_companions(
         a_q, b_q = pose_of(values, var[ends[q, 0], at.V_AT]), pose_of(values, var[ends[q, 1], at.V_AT])
         for p in new:
             a, b = pose_of(values, var[ends[p, 0], at.V_AT]), pose_of(values, var[ends[p, 1], at.V_AT])
-            to_a, back = composed(motion_to(a, a_q), second), motion_to(b_q, b)
-            x, y, c, s = motion_to(motion_at(z[p]), composed(to_a, back))
+            to_a, back = motion_product(motion_to(a, a_q), second), motion_to(b_q, b)
+            x, y, c, s = motion_to(motion_at(z[p]), motion_product(to_a, back))
             if abs(x) <= metres and abs(y) <= metres and abs(math.atan2(s, c)) <= radians:
                 found[count] = q
                 count += 1

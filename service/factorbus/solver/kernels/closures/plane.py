@@ -39,7 +39,7 @@ def judge_each_plane(a: F64, b: F64, z: F64, noise: F64, known: F64, out: F64) -
         P[:, :] = 0.0
         for m in range(4):
             add_predicted(J, 3 * (m // 2), 6 * k + 3 * (m // 2), 3 * (m % 2), 6 * k + 3 * (m % 2), known, P)
-        weigh(loop, P, noise[k], out[k])
+        weigh_motion(loop, P, noise[k], out[k])
 
 
 @kernel("void(float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,::1], float64[:,:,::1])")
@@ -55,23 +55,23 @@ def weights_without_plane(a: F64, b: F64, noise: F64, known: F64, out: F64) -> N
         P[:, :] = 0.0
         for m in range(4):
             add_predicted(J, 3 * (m // 2), 6 * k + 3 * (m // 2), 3 * (m % 2), 6 * k + 3 * (m % 2), known, P)
-        lower_factor(noise[k], 0.0, L)
-        solve_lower(L, P)  # P := L⁻¹ P L⁻ᵀ, which is symmetric
-        turn(P)
-        solve_lower(L, P)
+        cholesky_plane(noise[k], 0.0, L)
+        solve_plane(L, P)  # P := L⁻¹ P L⁻ᵀ, which is symmetric
+        transpose_plane(P)
+        solve_plane(L, P)
         for r in range(3):
             for c in range(3):
                 P[r, c], B[r, c] = (1.0 if r == c else 0.0) - P[r, c], 1.0 if r == c else 0.0
-        lower_factor(P, HELD, K)
-        solve_lower(L, B)
-        solve_lower(K, B)
+        cholesky_plane(P, HELD, K)
+        solve_plane(L, B)
+        solve_plane(K, B)
         for r in range(3):
             for c in range(3):
                 out[k, r, c] = B[0, r] * B[0, c] + B[1, r] * B[1, c] + B[2, r] * B[2, c]
 
 
 @inline_kernel
-def solve_lower(L: F64, B: F64) -> None:
+def solve_plane(L: F64, B: F64) -> None:
     """B := L⁻¹ B."""
     for c in range(3):
         B[0, c] /= L[0, 0]
@@ -80,7 +80,7 @@ def solve_lower(L: F64, B: F64) -> None:
 
 
 @inline_kernel
-def turn(B: F64) -> None:
+def transpose_plane(B: F64) -> None:
     """B := Bᵀ."""
     B[0, 1], B[1, 0] = B[1, 0], B[0, 1]
     B[0, 2], B[2, 0] = B[2, 0], B[0, 2]
@@ -88,7 +88,7 @@ def turn(B: F64) -> None:
 
 
 @inline_kernel
-def lower_factor(S: F64, least: float, L: F64) -> None:
+def cholesky_plane(S: F64, least: float, L: F64) -> None:
     """L Lᵀ = S; infinite where a pivot is not above `least`."""
     for r in range(3):
         for c in range(r + 1):
@@ -115,9 +115,9 @@ def judge_pairs_plane(a: F64, b: F64, z: F64, noise: F64, known: F64, i: I64, j:
     for k in range(i.size):
         p, q = i[k], j[k]
         first = inverse_of(motion_at(z[p]))
-        between = composed(first, motion_to(motion_at(a[p]), motion_at(a[q])))
-        before = composed(between, motion_at(z[q]))
-        loop = composed(before, motion_to(motion_at(b[q]), motion_at(b[p])))
+        between = motion_product(first, motion_to(motion_at(a[p]), motion_at(a[q])))
+        before = motion_product(between, motion_at(z[q]))
+        loop = motion_product(before, motion_to(motion_at(b[q]), motion_at(b[p])))
         # aᵢ, bᵢ, aⱼ, bⱼ, as increments at the start of the loop
         put_adjoint(first, -1.0, 0, J)
         put_adjoint(loop, 1.0, 3, J)
@@ -135,11 +135,11 @@ def judge_pairs_plane(a: F64, b: F64, z: F64, noise: F64, known: F64, i: I64, j:
         for r in range(3):
             for c in range(3):
                 N[r, c] = noise[p, r, c] + G[r, 0] * J[c, 9] + G[r, 1] * J[c, 10] + G[r, 2] * J[c, 11]
-        weigh(loop, P, N, out[k])
+        weigh_motion(loop, P, N, out[k])
 
 
 @inline_kernel
-def weigh(T: Motion, P: F64, N: F64, out: F64) -> None:
+def weigh_motion(T: Motion, P: F64, N: F64, out: F64) -> None:
     """out (4, 3) of a residual Log T, which is predicted with covariance P and measured with N."""
     half, mean = 0.5 * (P[0, 0] - P[1, 1]), 0.5 * (P[0, 0] + P[1, 1])
     largest = max(mean + math.sqrt(half * half + P[0, 1] * P[0, 1]), 0.0)
@@ -190,7 +190,7 @@ def motion_at(T: F64) -> Motion:
 
 
 @inline_kernel
-def composed(A: Motion, B: Motion) -> Motion:
+def motion_product(A: Motion, B: Motion) -> Motion:
     """A B."""
     x, y, c, s = A
     return x + c * B[0] - s * B[1], y + s * B[0] + c * B[1], c * B[2] - s * B[3], s * B[2] + c * B[3]
@@ -206,4 +206,4 @@ def inverse_of(A: Motion) -> Motion:
 @inline_kernel
 def motion_to(A: Motion, B: Motion) -> Motion:
     """A⁻¹ B."""
-    return composed(inverse_of(A), B)
+    return motion_product(inverse_of(A), B)
