@@ -57,6 +57,7 @@ from factorbus.proto.symbols import symbol
 
 # The map that inserts and answers are of: stated there, and solved.
 _KITCHEN = runpy.run_path(str(Path(__file__).with_name("kitchen.py")))
+_TESTED = runpy.run_path(str(Path(__file__).with_name("tested.py")))
 _COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64", "scale": "f64"}
 # Of the questions about uncertainty and their answers, §16.
 _COLUMNS |= dict.fromkeys(("others", "dims", "other_dims", "landmarks", "observations", "candidates"), "i64")
@@ -68,6 +69,8 @@ _COLUMNS |= {"factors": "i64", "ids": "i64", "weight": "f64"}
 _COLUMNS |= {"stamps": "i64", "box": "f64"}
 # Of replicas, §19.
 _COLUMNS |= {"chain": "u8", "named": "i64"}
+# Of closures that are tested, §20.
+_COLUMNS |= {"chance": "f64"} | dict.fromkeys(("tried", "came", "changed"), "i64")
 _CUTS = (slice(None, -1), slice(-1, None))
 
 
@@ -86,6 +89,7 @@ def vectors() -> dict[str, bytes]:
     return {
         **kitchen,
         **_records(17),
+        **_TESTED["messages"](),
         **_interests(codec.decode_estimate(kitchen["estimate"])),
         **{
             f"kinds/{name}": codec.encode_insert(Insert(1, _one_of(kind), epoch=7))

@@ -207,3 +207,37 @@ def test_an_edit_is_in_the_journal_under_the_name_of_who_made_it(spawn: Callable
     with closing(sqlite3.connect(next(folder.rglob("journal.db")))) as journal:
         clients = [client for (client,) in journal.execute("SELECT client FROM entry ORDER BY number")]
     assert [client.rpartition("-")[0] for client in clients] == ["robot", "gateway-ann"]
+
+
+def test_closures_that_a_map_tests_are_accepted_and_rejected(bus: Bus, gateway: str) -> None:
+    editor = Editor(gateway, "tested")
+    with bus.map("tested", closures="test") as joined:
+        joined.insert(square(false_closure=True))
+        unsure, suspect = editor.ask("suspects")["closures"]
+        assert (unsure["keys"], unsure["reason"]) == (["x0", "x16"], "unsure"), "a first loop might be chance"
+        assert (suspect["keys"], suspect["state"], suspect["reason"]) == (["x2", "x10"], "suspect", "improbable")
+        assert suspect["distance"] > 100
+        assert 0 <= suspect["chance"] < 0.02
+        made = editor.edit("accept_closures", factors=[suspect["id"]])
+        assert made["what"] == f"accepted closure {suspect['id']}"
+        assert made["chi2"] > 10 > made["chi2_before"]
+        assert editor.factor_between("x2", "x10") == suspect["id"], "it has the id that it had"
+        assert editor.edit("undo", number=1)["undone"] == "local"
+        _, rejected = editor.ask("suspects")["closures"]
+        assert (rejected["id"], rejected["state"], rejected["reason"]) == (suspect["id"], "rejected", "user")
+        assert refused(lambda: editor.edit("reject_closures", factors=[0]))["code"] == "not_a_closure"
+        assert editor.edit("reject_closures", factors=[unsure["id"]])["what"] == f"rejected closure {unsure['id']}"
+        assert [row["state"] for row in editor.ask("suspects")["closures"]] == ["rejected", "rejected"]
+
+
+def test_what_an_editor_restores_in_such_a_map_is_not_tested_again(bus: Bus, gateway: str) -> None:
+    editor = Editor(gateway, "restored")
+    with bus.map("restored", closures="test") as joined:
+        joined.insert(square(false_closure=True))
+        false = editor.ask("suspects")["closures"][1]["id"]
+        editor.edit("accept_closures", factors=[false])
+        editor.edit("reject", factors=[false])
+        assert len(editor.ask("suspects")["closures"]) == 1
+        editor.edit("restore", factors=[false])
+        assert editor.factor_between("x2", "x10") > false
+        assert sum(joined.stats()["closure_states"].values()) == 1

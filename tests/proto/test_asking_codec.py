@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorbus.proto import asking_codec as codec
-from factorbus.proto import repair_codec
+from factorbus.proto import closures, repair_codec
 from factorbus.proto.asking import AskCovariance, Covariances
 from factorbus.proto.problems import BadMessage, Problem
 from factorbus.proto.symbols import symbol
@@ -33,6 +33,9 @@ CODECS: dict[str, tuple[Callable[[Any], bytes], Callable[[bytes], Any]]] = {
     "why": (codec.encode_why, codec.decode_why),
     "ask_repair": (repair_codec.encode_ask_repair, repair_codec.decode_ask_repair),
     "repaired": (repair_codec.encode_repaired, repair_codec.decode_repaired),
+    "ask_suspects": (closures.encode_ask_suspects, closures.decode_ask_suspects),
+    "suspects": (closures.encode_suspects, closures.decode_suspects),
+    "closure_entry": (closures.encode_closure_entry, closures.decode_closure_entry),
 }
 VECTORS = sorted(name for name in GOLDEN if any(name.startswith(known) for known in CODECS))
 

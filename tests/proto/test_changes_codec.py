@@ -21,6 +21,8 @@ GOOD: dict[str, dict[str, Any]] = {
     "fix": {"keys": TWO},
     "free": {"keys": TWO},
     "marginalize": {"keys": TWO},
+    "accept": {"factors": TWO},
+    "reject": {"factors": TWO},
     "place": {"kind": "point2", "keys": TWO, "values": 2 * NUMBERS},
 }
 

@@ -249,7 +249,8 @@ def test_every_code_is_in_the_table() -> None:
         "kind_taken",
         "named_twice",
         "too_large",
-        "unknown_closure",
+        "not_a_closure",
+        "switched_off",
     }  # changes, other kinds, closures
     assert codes - elsewhere == {code for code, _ in REFUSED.values()}
 

@@ -37,6 +37,7 @@ from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.asking import Repaired
 from factorbus.proto.camera import Camera
+from factorbus.proto.closures import Suspects
 from factorbus.proto.interest import Interest
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, MapGraph
 
@@ -76,11 +77,11 @@ class Bus:
         mirror: bool = True,
         create: bool = True,
         interest: Interest | None = None,
+        closures: str | None = None,
     ) -> AsyncIterator[Map]:
         """As `factorbus.client.Bus.map`, in `async with`; leaving it waits for what was sent."""
-        joined = await asyncio.to_thread(
-            self._bus.map, name, mode, window=window, mirror=mirror, create=create, interest=interest
-        )
+        how = {"window": window, "mirror": mirror, "create": create, "interest": interest, "closures": closures}
+        joined = await asyncio.to_thread(self._bus.map, name, mode, **how)
         try:
             here = Map(joined, window)
             yield here
@@ -105,9 +106,9 @@ class Bus:
         """What each service counts and times.  Raises Refused, Unavailable."""
         return await asyncio.to_thread(self._bus.stats)
 
-    async def create(self, name: str, mode: str = "auto") -> MapRow:
+    async def create(self, name: str, mode: str = "auto", *, closures: str | None = None) -> MapRow:
         """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName."""
-        return await asyncio.to_thread(self._bus.create, name, mode)
+        return await asyncio.to_thread(self._bus.create, name, mode, closures=closures)
 
     async def fork(self, name: str, target: str) -> MapRow:
         """A new map that begins as `name` is now.  Raises as `factorbus.client.Bus.fork`."""
@@ -250,6 +251,13 @@ class Map:
     ) -> Repaired:
         """Which factors are false, as in `factorbus.client.Map.repair`.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.repair(factors, probability, timeout_s))
+
+    async def suspects(self, every: bool = False, timeout_s: float | None = None) -> Suspects:
+        """Loop closures that the estimate does not have, as in `factorbus.client.Map.suspects`.
+
+        Raises Refused, Unavailable.
+        """
+        return await asyncio.wrap_future(self._map.ask.suspects(every, timeout_s))
 
     async def graph(self, timeout_s: float | None = None) -> MapGraph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""

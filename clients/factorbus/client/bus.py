@@ -76,12 +76,14 @@ class Bus:
         create: bool = True,
         client: str = "",
         interest: Interest | None = None,
+        closures: str | None = None,
     ) -> Map:
         """Join map `name`, creating it if there is none (with create=False: UnknownMap).
 
         window: inserts that may be unanswered at a time.  mirror: keep a live copy of the estimate; returns once
         it is there.  client: who inserts into this map, where one connection is used for several; empty: that of
         `connect`.  interest: mirror these variables alone, at its rate; `insert` does not wait until they are there.
+        closures: "trust" or "test", what becomes of its loop closures (None: as the service has it for new maps).
         Raises Refused, Unavailable, BadName, BadOption, UnknownKind, UnknownMap, NotSupported.
         """
         keys.checked_name("map", name)
@@ -98,7 +100,7 @@ class Bus:
             client,
             self.timeout_s,
             window,
-            lambda: self.create(name, mode) if create else self._existing(name),
+            lambda: self.create(name, mode, closures=closures) if create else self._existing(name),
         )
         self._maps = [*(each for each in self._maps if not each.closed), joined]
         try:
@@ -154,9 +156,16 @@ class Bus:
         told = query_all(self._link, "stats", checked_seconds("timeout_s", timeout_s, self.timeout_s))
         return [codec.decode_map(each) for each in told]
 
-    def create(self, name: str, mode: str = "auto", timeout_s: float | None = None) -> MapRow:
-        """Create map `name`, or find it as it is if its mode is the same.  Raises Refused, Unavailable, BadName."""
-        return self._admin("create", {"map": keys.checked_name("map", name), "mode": mode}, _row, timeout_s)
+    def create(
+        self, name: str, mode: str = "auto", timeout_s: float | None = None, *, closures: str | None = None
+    ) -> MapRow:
+        """Create map `name`, or find it as it is if its mode is the same, and its policy for loop closures.
+
+        closures: "trust" or "test"; None: that of a map which is there, or what the service has for new ones.
+        Raises Refused, Unavailable, BadName.
+        """
+        asked = {"map": keys.checked_name("map", name), "mode": mode}
+        return self._admin("create", asked if closures is None else asked | {"closures": closures}, _row, timeout_s)
 
     def fork(self, name: str, target: str, timeout_s: float | None = None) -> MapRow:
         """A new map `target` that begins as map `name` is now: a what-if, which may be tried out and dropped.
@@ -261,4 +270,5 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         converging=fields.flag(where, content, "converging"),
         reproducible=fields.flag(where, content, "reproducible") if "reproducible" in content else None,
         reason=fields.text(where, content, "reason", default=""),
+        closures=fields.text(where, content, "closures", default="trust"),
     )

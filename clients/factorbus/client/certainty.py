@@ -52,11 +52,13 @@ class Certainty(TypedDict, total=False):
     information of 1/s² of an angle in radians is 4/s² there.
     loss: what it counts where it is far off: ("huber", 1.345), a name of `factorbus.proto.kinds.LOSSES` and its scale
     in standard deviations; the name alone has the scale of DEFAULT_SCALES.
+    trusted: it is not tested where the map tests loop closures, as odometry is not.
     """
 
     sigmas: ArrayLike
     information: ArrayLike
     loss: tuple[str, float] | str | None
+    trusted: bool
 
 
 class FeatureCertainty(TypedDict, total=False):
@@ -99,7 +101,10 @@ def triangle_of(where: str, dim: int, certainty: Certainty, kind: str = "") -> F
 def transform_certainty(where: str, dim: int, certainty: Certainty, A: F64, kind: str) -> Certainty:
     """The certainty of r' where this is that of r = A r', both of a factor of `kind`."""
     W = full(triangle_of(where, dim, certainty, kind), dim)
-    return {"information": (A.T @ W @ A)[np.triu_indices(dim)], "loss": certainty.get("loss")}
+    made: Certainty = {"information": (A.T @ W @ A)[np.triu_indices(dim)], "loss": certainty.get("loss")}
+    if "trusted" in certainty:
+        made["trusted"] = certainty["trusted"]
+    return made
 
 
 def inverted(where: str, covariance: ArrayLike, certainty: Mapping[str, object]) -> Certainty:

@@ -75,6 +75,14 @@ class Changes:
         weights = all_finite("changes: weight", _each("weight", weight, ids))
         return self._add(Change("weigh", ids, weight=weights))
 
+    def accept(self, factors: Iterable[int] | int) -> Changes:
+        """These loop closures are in the estimate, for good: of a map that tests them (`Map.suspects`)."""
+        return self._add(Change("accept", _factor_ids(factors)))
+
+    def reject(self, factors: Iterable[int] | int) -> Changes:
+        """These loop closures are out of the estimate, for good, and keep their ids: of a map that tests them."""
+        return self._add(Change("reject", _factor_ids(factors)))
+
     def fix(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables are held where they are."""
         return self._add(Change("fix", keys=_keys(keys)))

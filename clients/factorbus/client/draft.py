@@ -362,7 +362,8 @@ class Draft:
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
         row = checked_row(f"{where}: measured", measured, of.size)
         loss = loss_of(where, certainty.get("loss"))
-        self._columns.add_factor(kind, numbers, row, triangle_of(where, of.dim, certainty, kind), loss)
+        trusted = checked_flag(f"{where}: trusted", certainty.get("trusted", False))
+        self._columns.add_factor(kind, numbers, row, triangle_of(where, of.dim, certainty, kind), loss, trusted)
         return self
 
     def _seen(self, kind: str, keys: tuple[Key, Key], measured: ArrayLike, certainty: SensorCertainty) -> Draft:

@@ -32,7 +32,7 @@ class DraftColumns:
 
     def __init__(self) -> None:
         self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[F64], list[int]]] = {}
-        self._factors: dict[tuple[str, str], tuple[list[list[int]], list[F64], list[F64], list[float]]] = {}
+        self._factors: dict[tuple[str, str, bool], tuple[list[list[int]], list[F64], list[F64], list[float]]] = {}
         self._linear: list[Factors] = []
 
     def add_variable(self, kind: str, key: int, value: F64 | None, fixed: bool, stamp: int) -> None:
@@ -43,10 +43,12 @@ class DraftColumns:
         if value is not None:
             rows.append(value)
 
-    def add_factor(self, kind: str, keys: list[int], measured: F64, triangle: F64, loss: tuple[str, float]) -> None:
+    def add_factor(
+        self, kind: str, keys: list[int], measured: F64, triangle: F64, loss: tuple[str, float], trusted: bool
+    ) -> None:
         """triangle: the upper one of its information.  loss: name and scale, ("", 0) for none."""
         name, scale = loss
-        all_keys, all_measured, triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
+        all_keys, all_measured, triangles, scales = self._factors.setdefault((kind, name, trusted), ([], [], [], []))
         scales.append(scale)
         all_keys.append(keys)
         all_measured.append(measured)
@@ -80,8 +82,10 @@ class DraftColumns:
                 np.array(information),
                 loss,
                 np.array(scales) if loss else None,
+                None,
+                trusted,
             )
-            for (kind, loss), (keys, measured, information, scales) in self._factors.items()
+            for (kind, loss, trusted), (keys, measured, information, scales) in self._factors.items()
         ]
         return Batch(tuple(variables), (*factors, *self._linear))
 

@@ -19,17 +19,18 @@ from factorbus.client.interest_mirror import InterestMirror
 from factorbus.client.key_numbers import Key
 from factorbus.client.link import Link
 from factorbus.client.map_row import MapRow
-from factorbus.client.merging import Merged, fit_into
+from factorbus.client.merging import Merged, as_trusted, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import PendingInsert
 from factorbus.client.questions import Questions, logged
 from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.request_sender import Request, RequestSender
-from factorbus.client.supported import check_changes, check_interest, check_stamps
+from factorbus.client.supported import check_changes, check_interest, check_stamps, check_suspects, check_trusted
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
+from factorbus.proto.closures import Suspects
 from factorbus.proto.interest import Interest
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Insert, MapGraph
@@ -156,7 +157,8 @@ class Map:
         here = self.ask_estimate(timeout_s=timeout_s)
         fitted = fit_into(here, other, anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute)
         with saying_how_to_rename():
-            return Merged(self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
+            batch = as_trusted(fitted.batch) if self.closures == "test" else fitted.batch
+            return Merged(self.insert(batch, settle=settle, timeout_s=timeout_s), fitted)
 
     def send(
         self,
@@ -174,6 +176,7 @@ class Map:
         batch, settle = batch_of("batch", batch), checked_flag("settle", settle)
         listed = () if changes is None else of_type("changes", changes, Changes, "a Changes").listed()
         check_stamps(self._protocol, batch)
+        check_trusted(self._protocol, batch)
         timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
@@ -262,6 +265,14 @@ class Map:
         """
         return self.ask.repair(factors, probability, timeout_s).result()
 
+    def suspects(self, every: bool = False, timeout_s: float | None = None) -> Suspects:
+        """Loop closures that the estimate does not have, or `every` one: of a map that tests them.
+
+        Raises Refused, Unavailable, NotSupported.
+        """
+        check_suspects(self._protocol)
+        return self.ask.suspects(every, timeout_s).result()
+
     def graph(self, timeout_s: float | None = None) -> MapGraph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""
         return self.ask.graph(timeout_s).result()
@@ -330,7 +341,7 @@ class Map:
         The suffix makes the name that of one run of one handle: sequence numbers start at 1 for a new name, and
         two processes that use the same name by mistake do not answer for each other.
         """
-        self.name, self.mode, self.epoch = row.name, row.mode, row.epoch
+        self.name, self.mode, self.epoch, self.closures = row.name, row.mode, row.epoch, row.closures
         self._row, self._protocol = row, row.protocol
         self.client = f"{self._client}-{os.urandom(4).hex()}"
         self._key = keys.insert_key(self.name, self.client)

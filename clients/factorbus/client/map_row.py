@@ -14,7 +14,8 @@ class MapRow:
     protocol: the names that its service knows (`changes`, `factors`, ...), as §13 of the contract has them; empty in a
     list of maps.  converged: its last step had; None: the service does not say.  converging: it takes further steps by
     itself, unless an insert comes.  reproducible: as far as is known, its journal gives the same estimate again to the
-    bit; if not, `reason` says why; None: it has no journal, or the service does not say.
+    bit; if not, `reason` says why; None: it has no journal, or the service does not say.  closures: "test" where loop
+    closures are tested when they come.
     """
 
     name: str
@@ -30,3 +31,4 @@ class MapRow:
     converging: bool = False
     reproducible: bool | None = None
     reason: str = ""
+    closures: str = "trust"

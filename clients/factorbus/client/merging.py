@@ -105,6 +105,11 @@ class Merged:
     fitted: Fitted
 
 
+def as_trusted(batch: Batch) -> Batch:
+    """The same, none of which is tested by a map that tests its loop closures: a person sends it."""
+    return batch._replace(factors=tuple(group._replace(trusted=True) for group in batch.factors))
+
+
 def fit_into(
     here: Estimate,
     other: MapGraph,

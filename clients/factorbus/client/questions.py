@@ -10,6 +10,7 @@ from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import AskRepair, Repaired
+from factorbus.proto.closures import AskSuspects, Suspects, decode_suspects, encode_ask_suspects
 from factorbus.proto.interest import Interest, checked_interest
 from factorbus.proto.interest_codec import filter_map
 from factorbus.proto.messages import Chi2, Estimate, MapGraph
@@ -78,6 +79,11 @@ class Questions:
         chosen = None if factors is None else id_numbers("repair", factors)
         question = encode_ask_repair(AskRepair(chosen, checked_probability("probability", probability), values=True))
         return self._ask("repair", question, decode_repaired, timeout_s)
+
+    def suspects(self, every: bool, timeout_s: float | None) -> Future[Suspects]:
+        """Loop closures that the estimate does not have, or all of them."""
+        question = encode_ask_suspects(AskSuspects(checked_flag("every", every)))
+        return self._ask("suspects", question, decode_suspects, timeout_s)
 
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
         what = f"map {self._map!r}, asked for its {question},"

@@ -24,6 +24,19 @@ def check_stamps(protocol: Mapping[str, Any], batch: Batch) -> None:
         raise NotSupported("time stamps of variables", str(protocol.get("product", "")))
 
 
+def check_trusted(protocol: Mapping[str, Any], batch: Batch) -> None:
+    """Raises NotSupported where a service with this protocol would skip it."""
+    skipped = bool(protocol) and "trusted" not in protocol.get("factor_fields", ())
+    if skipped and any(group.trusted for group in batch.factors):
+        raise NotSupported("trusted factors", str(protocol.get("product", "")))
+
+
+def check_suspects(protocol: Mapping[str, Any]) -> None:
+    """Raises NotSupported where a service with this protocol does not test loop closures."""
+    if protocol and "suspects" not in protocol.get("questions", ()):
+        raise NotSupported("a map that tests its loop closures", str(protocol.get("product", "")))
+
+
 def check_interest(protocol: Mapping[str, Any]) -> None:
     """Raises NotSupported where a service with this protocol knows of no interests."""
     if protocol and "interest" not in protocol.get("questions", ()):

@@ -8,6 +8,7 @@
 | /api/maps/NAME/variables/KEY | what holds x12 where it is |
 | /api/maps/NAME/optimum | χ² beside the optimum from scratch, whether that converged, a notice where it is better |
 | /api/maps/NAME/edges, /factors/17 | which factor is between which variables; what one measures, and how it fits |
+| /api/maps/NAME/suspects | loop closures that the estimate does not have, of a map that tests them |
 | /api/maps/NAME/session, /edits | who asks and whether they may edit; what was edited, and with POST an edit |
 | /api/maps/NAME/export?format=g2o | text, also `pyfg`, `jrl`, `tum` and `kitti`, of several robots with `&robot=a` |
 | /api/maps/NAME/live | WebSocket: the estimate, then what each step changed |

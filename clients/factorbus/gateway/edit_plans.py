@@ -42,6 +42,18 @@ def _restore(request: EditRequest, _: MapGraph, log: EditLog) -> EditPlan:
     return EditPlan(f"restored {_called(back)}", EditStep(restore=back), lambda _: EditStep(reject=back))
 
 
+def _accept_closures(request: EditRequest, _: MapGraph, __: EditLog) -> EditPlan:
+    ids = tuple(request.fields["factors"])
+    what = f"accepted {_closures(ids)}"
+    return EditPlan(what, EditStep(accept=ids), lambda _: EditStep(disbelieve=ids))
+
+
+def _reject_closures(request: EditRequest, _: MapGraph, __: EditLog) -> EditPlan:
+    ids = tuple(request.fields["factors"])
+    what = f"rejected {_closures(ids)}"
+    return EditPlan(what, EditStep(disbelieve=ids), lambda _: EditStep(accept=ids))
+
+
 def _weigh(request: EditRequest, graph: MapGraph, _: EditLog) -> EditPlan:
     rows, weight = _factors(graph, request.fields["factors"]), request.fields["weight"]
     ids = tuple(ids_of(rows))
@@ -87,7 +99,8 @@ def _inserting(what: str, draft: Draft) -> EditPlan:
 
 
 _PLANS: Mapping[str, Callable[[EditRequest, MapGraph, EditLog], EditPlan]] = {
-    "reject": _reject, "restore": _restore, "weigh": _weigh, "fix": _fix, "free": _free, "prior": _prior,
+    "reject": _reject, "restore": _restore, "accept_closures": _accept_closures, "reject_closures": _reject_closures,
+    "weigh": _weigh, "fix": _fix, "free": _free, "prior": _prior,
     "anchor": _anchor,
 }  # fmt: skip
 
@@ -137,6 +150,11 @@ def _called(groups: tuple[Factors, ...]) -> str:
     ]
     more = f" and {len(each) - _FEW} more" if len(each) > _FEW else ""
     return f"{counted(len(each), 'factor')}: {', '.join(each[:_FEW])}{more}" if len(each) > 1 else each[0]
+
+
+def _closures(ids: tuple[int, ...]) -> str:
+    more = f" and {len(ids) - _FEW} more" if len(ids) > _FEW else ""
+    return f"{'closure' if len(ids) == 1 else 'closures'} {', '.join(map(str, ids[:_FEW]))}{more}"
 
 
 def _named(keys: tuple[int, ...]) -> str:

@@ -4,6 +4,7 @@
 |---|---|---|
 | reject | factors | factors go, and can be restored |
 | restore | factors | those that were rejected come back |
+| accept_closures, reject_closures | factors | of a map that tests them: they are in for good, or out |
 | weigh | factors, weight | their information is multiplied by it |
 | fix, free | keys | variables are held, and estimated again |
 | prior | key, value, sigmas | a variable is where one has dragged it to, give or take |
@@ -130,6 +131,8 @@ _USUAL: Mapping[str, Any] = {"absolute": "refuse"}
 _FIELDS: Mapping[str, Mapping[str, Callable[[str, Any], Any]]] = {
     "reject": {"factors": _ids},
     "restore": {"factors": _ids},
+    "accept_closures": {"factors": _ids},
+    "reject_closures": {"factors": _ids},
     "weigh": {"factors": _ids, "weight": _positive},
     "fix": {"keys": _some_keys},
     "free": {"keys": _some_keys},

@@ -1,6 +1,7 @@
 """Editing over HTTP: who asks, what was edited, what there is to select, and edits themselves."""
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable
 
 from starlette.requests import Request
@@ -26,6 +27,7 @@ def editing_routes(one: str, maps: JoinedMaps, guard: Guard) -> list[Route]:
         "session": (routes.session, "GET"),
         "edits": (routes.edits, "GET"),
         "edges": (routes.edges, "GET"),
+        "suspects": (routes.suspects, "GET"),
         "factors/{id}": (routes.factor, "GET"),
     }
     listed = [Route(f"{one}/{path}", answer, methods=[method]) for path, (answer, method) in answers.items()]
@@ -70,6 +72,25 @@ class _EditRoutes:
         fixed = [format_symbol(key) for g in graph.batch.variables if g.fixed for key in g.keys.tolist()]
         return Document({"revision": graph.revision, "factors": groups, "fixed": fixed})
 
+    async def suspects(self, request: Request) -> Response:
+        """Loop closures that the estimate does not have, of a map that tests them."""
+        async with self._maps.using(request.path_params["name"]) as joined:
+            found = await asyncio.wrap_future(joined.map.ask.suspects(False, None))
+        listed = [
+            {
+                "id": factor,
+                "kind": name_of_kind(found.kinds[k]),
+                "keys": [format_symbol(key) for key in found.keys[k].tolist()],
+                "state": found.states[k],
+                "reason": found.reasons[k],
+                "distance": _told(float(found.distance[k])),
+                "chance": _told(float(found.chance[k])),
+                "since": int(found.changed[k]),
+            }
+            for k, factor in enumerate(found.factors.tolist())
+        ]
+        return Document({"revision": found.revision, "policy": found.policy, "closures": listed})
+
     async def factor(self, request: Request) -> Response:
         """What one factor says, and how it fits."""
         text = request.path_params["id"]
@@ -80,3 +101,8 @@ class _EditRoutes:
             why = await asyncio.wrap_future(joined.map.uncertainty.ask.why(AskWhy(None, int(text)), None))
         log = await self._editing.log(request.path_params["name"])
         return Document(explain_factor(why, graph) | {"inserted": log.inserted(int(text))})
+
+
+def _told(number: float) -> float | None:
+    """None of what nobody has looked at: JSON has no NaN."""
+    return number if math.isfinite(number) else None

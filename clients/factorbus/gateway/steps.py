@@ -16,7 +16,8 @@ class EditStep(NamedTuple):
 
     weigh: ids of factors, and a weight for each.  reject: factors that go and can be restored.  remove: ids of factors
     that go for good.  forget: keys of variables that no factor is on afterwards.  fix, free: keys.  insert: what is
-    new.  restore: factors that were rejected, with the ids they had.
+    new.  restore: factors that were rejected, with the ids they had.  accept, disbelieve: ids of closures that the map
+    tests, which are in for good, or out.
     """
 
     weigh: tuple[tuple[int, ...], tuple[float, ...]] = ((), ())
@@ -27,6 +28,8 @@ class EditStep(NamedTuple):
     free: tuple[int, ...] = ()
     insert: Batch = Batch()
     restore: tuple[Factors, ...] = ()
+    accept: tuple[int, ...] = ()
+    disbelieve: tuple[int, ...] = ()
 
     def changes(self, called: Callable[[int], int]) -> Changes | None:
         """What of it is changes; None: nothing.  called: what a factor is called now."""
@@ -42,6 +45,10 @@ class EditStep(NamedTuple):
             changes.fix(*self.fix)
         if self.free:
             changes.free(*self.free)
+        if self.accept:
+            changes.accept([called(each) for each in self.accept])
+        if self.disbelieve:
+            changes.reject([called(each) for each in self.disbelieve])
         return changes if changes.listed() else None
 
     def batch(self) -> Batch:

@@ -73,6 +73,8 @@ def _factors_map(group: Factors) -> dict[str, Any]:
         content |= {"loss": group.loss, "scale": _bytes(group.scale, F8)}
     if group.ids is not None:
         content["ids"] = _whole("factors", "ids", group.ids)
+    if group.trusted:
+        content["trusted"] = True
     return content
 
 
@@ -127,17 +129,18 @@ def _read_factors(index: int, content: Map) -> Factors:
     measured = fields.rows(place, content, "measured", len(keys), known.size)
     information = fields.rows(place, content, "information", len(keys), known.information_size)
     ids = _read_numbers(place, content, "ids", len(keys)) if "ids" in content else None
+    trusted = fields.flag(place(), content, "trusted") if "trusted" in content else False
     loss = content.get("loss")
     if loss is None:
         if content.get("scale") is not None:
             raise BadMessage(f"{place()}.scale", "a scale without a loss", f"loss: one of {', '.join(LOSSES)}")
-        return Factors(known.name, keys, measured, information, ids=ids)
+        return Factors(known.name, keys, measured, information, ids=ids, trusted=trusted)
     if type(loss) is not str or loss not in LOSSES:
         if type(loss) is not str:
             raise BadMessage(f"{place()}.loss", "not a string", f"one of {', '.join(LOSSES)}, or no such field")
         raise BadLoss(f"{place()}.loss", repr(loss[:64]), f"one of {', '.join(LOSSES)}, or no such field")
     scale = fields.rows(place, content, "scale", len(keys), 1).reshape(-1)
-    return Factors(known.name, keys, measured, information, loss, scale, ids)
+    return Factors(known.name, keys, measured, information, loss, scale, ids, trusted)
 
 
 def _read_numbers(place: Callable[[], str], content: Map, name: str, count: int) -> I64:

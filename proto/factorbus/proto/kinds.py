@@ -362,5 +362,7 @@ CHANGES = {
         ChangeKind("free", "keys"),
         ChangeKind("place", "keys", "values"),
         ChangeKind("marginalize", "keys"),
+        ChangeKind("accept", "factors"),
+        ChangeKind("reject", "factors"),
     )
 }

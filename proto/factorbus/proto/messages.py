@@ -39,7 +39,7 @@ class Factors(NamedTuple):
     keys (m, arity) in the kind's `connects` order; measured (m, kind.size); information (m, r(r+1)/2): the upper
     triangle of the information matrix (inverse covariance) row by row, r = kind.dim.  loss: one of `kinds.LOSSES` that
     all of them have, "": none; scale (m,): of the loss, standard deviations.  ids (m,): of a whole graph, what each is
-    called in changes and questions.
+    called in changes and questions.  trusted: none of them is tested, where the map tests closures.
     """
 
     kind: str
@@ -49,6 +49,7 @@ class Factors(NamedTuple):
     loss: str = ""
     scale: F64 | None = None
     ids: I64 | None = None
+    trusted: bool = False
 
 
 class Change(NamedTuple):
@@ -61,6 +62,7 @@ class Change(NamedTuple):
     weigh             factors, weight (n,)       their information is multiplied by it
     fix, free         keys                       held where they are; estimated again
     marginalize       keys                       they go; what their factors say of others is kept
+    accept, reject    factors                    closures that the map tests are in, or out, for good
     place             kind, keys, values, carry  variables of one kind go to these values (n, size); carry: what is not
                                                  placed by this insert goes along with what it hangs on
     """

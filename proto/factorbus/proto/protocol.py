@@ -10,6 +10,8 @@ from factorbus.proto.version import __version__
 INSERT_FIELDS = ("sequence", "epoch", "settle", "convert_below", "changes", "variables", "factors")
 # Those of a group of variables in it, likewise.
 VARIABLE_FIELDS = ("kind", "keys", "values", "fixed", "stamps")
+# Those of a group of factors in it, likewise.
+FACTOR_FIELDS = ("kind", "keys", "measured", "information", "loss", "scale", "trusted")
 
 
 def known() -> dict[str, Any]:
@@ -19,6 +21,7 @@ def known() -> dict[str, Any]:
         "product": __version__,
         "insert": list(INSERT_FIELDS),
         "variable_fields": list(VARIABLE_FIELDS),
+        "factor_fields": list(FACTOR_FIELDS),
         "variables": list(VARIABLE_KINDS),
         "factors": list(FACTOR_KINDS),
         "losses": list(LOSSES),

@@ -6,6 +6,7 @@ from typing import Any
 # What each documented field is where a service does not tell it: nothing counted, nothing known.
 _TEXTS = ("mode", "strategy", "because")
 _COUNTS = (
+    "closures", "suspects",
     "iterations", "new_variables", "new_factors", "changed", "relinearized", "eliminated", "nnz_r", "flops", "inactive",
     "points", "removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables",
     "placed_variables", "added_factors",

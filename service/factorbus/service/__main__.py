@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from factorbus.ownership import UnsafeFolder
+from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.problems import Problem
 from factorbus.service.config import DURABILITIES, Config, checked_config, load_config
 
@@ -44,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--create", action="append", metavar="MAP", help="a map to have from the start")
     parser.add_argument("--journal", metavar="DIR", help="keep maps here, across restarts and crashes")
     parser.add_argument("--durability", choices=DURABILITIES, help="what an answer promises: see service/README.md")
+    parser.add_argument("--closures", choices=CLOSURE_POLICIES, help="of new maps: believe loop closures, or test them")
     parser.add_argument("--standby", action="store_true", help="wait until the journal's owner is gone, and take over")
     parser.add_argument("--upstream", metavar="ENDPOINT", help="be a replica of the service there")
     parser.add_argument("--upstream-zenoh", metavar="FILE", help="Zenoh configuration of the session with it")
@@ -64,6 +66,7 @@ def _config(options: argparse.Namespace) -> Config:
             "zenoh",
             "journal",
             "durability",
+            "closures",
             "upstream",
             "upstream_zenoh",
         )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
+from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import MessageLimits
@@ -80,6 +81,9 @@ class Config:
     name: str = ""  # of this service, in its liveliness tokens; empty: made up
     maps: str = "*"
     create: tuple[str, ...] = ()
+    closures: str = (
+        "trust"  # of maps that are new here, unless the client that creates one says otherwise: trust or test
+    )
     zenoh: str = ""
     insecure: bool = False
     warm: bool = True  # compile every kernel before taking the first insert
@@ -134,6 +138,8 @@ def checked_config(config: Config) -> Config:
         raise BadConfig(f"cores_from_bytes is {config.cores_from_bytes}; wanted 0, for maps of any size, or more")
     if config.metrics and not _HOST_PORT.fullmatch(config.metrics):
         raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
+    if config.closures not in CLOSURE_POLICIES:
+        raise BadConfig(f"closures is {config.closures!r}; wanted {' or '.join(CLOSURE_POLICIES)}")
     if config.durability not in DURABILITIES:
         raise BadConfig(f"durability is {config.durability!r}; wanted {', '.join(DURABILITIES)}")
     if config.standby and not config.journal:

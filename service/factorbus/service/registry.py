@@ -21,7 +21,7 @@ from factorbus.service.bus.zenoh_session import MapPlace, ServiceBus
 from factorbus.service.config import Config
 from factorbus.service.core.events import Asker, Read
 from factorbus.service.core.map_state import MapCore
-from factorbus.service.journal.library import CopiedAt, Kept, Library, make_map_solver, restored
+from factorbus.service.journal.library import CopiedAt, Kept, Library, closure_policy_of, make_map_solver, restored
 from factorbus.service.maps.host import Host
 from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.process.heap import give_back
@@ -33,10 +33,10 @@ from factorbus.service.questions.admin import (
     MapExists,
     NotDamaged,
     NotHere,
-    OtherMode,
+    check_made_as,
     ours,
     settled_mode,
-)
+)  # fmt: skip
 from factorbus.service.questions.answers import Copied, Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.solving.apply import MapSolver
@@ -157,16 +157,16 @@ class Maps:
             found.place.announce()
             found.host.created()
 
-    def create(self, name: str, mode: str | None) -> dict[str, Any]:
-        """The row of map `name`, made if it is not there.  mode: None for whichever it has.  Raises Problem."""
+    def create(self, name: str, mode: str | None, closures: str = "") -> dict[str, Any]:
+        """The row of map `name`, made if it is not there.  mode: None, closures: "" for whichever.  Raises Problem."""
         if found := self._maps.get(name):
-            if mode is not None and found.host.core.mode != settled_mode(mode):
-                raise OtherMode(name, found.host.core.mode, settled_mode(mode))
-            return found.host.core.row()
+            core = found.host.core
+            check_made_as(name, (core.mode, core.closures), mode and settled_mode(mode), closures)
+            return core.row()
         if not ours(self._config.maps, keys.checked_name("map", name)):
             raise NotHere(name, self._config.maps)
         self._check_room()
-        return self._open(name, self._make(name, settled_mode(mode or "auto")))
+        return self._open(name, self._make(name, settled_mode(mode or "auto"), closures))
 
     def create_all(self, names: Iterable[str]) -> None:
         """Have maps of these names; one that is on disk and does not open keeps the others from nothing."""
@@ -268,9 +268,9 @@ class Maps:
         for found in self._maps.values():
             found.place.close()
 
-    def _make(self, name: str, mode: str | None) -> OpenMap:
-        """mode: None for that of the map which is there.  Raises Problem."""
-        return self._at_work(*self._begin(name, mode))
+    def _make(self, name: str, mode: str | None, closures: str = "") -> OpenMap:
+        """mode: None, closures: "" for those of the map which is there.  Raises Problem."""
+        return self._at_work(*self._begin(name, mode, closures))
 
     def _at_work(self, core: MapCore, map_solver: MapSolver, kept: Kept | None) -> OpenMap:
         name = core.name
@@ -286,21 +286,20 @@ class Maps:
         made = OpenMap(host, place, options)
         return made
 
-    def _begin(self, name: str, mode: str | None) -> tuple[MapCore, MapSolver, Kept | None]:
+    def _begin(self, name: str, mode: str | None, closures: str) -> tuple[MapCore, MapSolver, Kept | None]:
         """What a map is made of, as it was or new.  Raises Problem."""
         limits, library, now = self._config.limits, self._library, time.monotonic()
         if problem := self._unopened.get(name):
             raise problem
         if library is not None and library.has(name):
-            if mode is not None and (had := library.mode(name)) != mode:
-                raise OtherMode(name, had, mode)
-            kept = library.open(name, limits)
+            kept = library.open(name, limits, mode, closures)
         elif library is not None:
-            kept = library.make(name, mode or settled_mode("auto"), limits)
+            kept = library.make(name, mode or settled_mode("auto"), limits, closures or self._config.closures)
         else:
             epoch, mode = secrets.randbits(62) | 1, mode or settled_mode("auto")
-            return MapCore(name, mode, epoch, limits, now), make_map_solver(mode, {}, epoch, limits), None
-        core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now)
+            made = make_map_solver(mode, {"closures": closures or self._config.closures}, epoch, limits)
+            return MapCore(name, mode, epoch, limits, now, closure_policy_of(made.options())), made, None
+        core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now, closure_policy_of(kept.header.options))
         kept.restore(core)
         return core, kept.map_solver, kept
 
@@ -362,7 +361,7 @@ class Maps:
             epoch = secrets.randbits(62) | 1
             map_solver = make_map_solver(was.mode, found.options, epoch, limits)
             map_solver.load(copied.state)
-        core = MapCore(fork.target, was.mode, epoch, limits, now)
+        core = MapCore(fork.target, was.mode, epoch, limits, now, was.closures)
         core.restore((), restored(map_solver, was.differs))
         return self._at_work(core, map_solver, kept)
 

@@ -93,6 +93,11 @@ class Solver:
         """What `changed` lists, as indices of variables, ascending, and the arenas to look them up in, to be read."""
         return self._stepper.changed(), self._graph
 
+    @property
+    def factor_graph(self) -> FactorGraph:
+        """The graph as it is: to be looked up in, and for `closures` to name factors."""
+        return self._graph
+
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
         return self._stepper.chi2()

@@ -117,6 +117,7 @@ def _rotation_first(information: F64) -> F64:
 _LOSSES = {
     "huber": gtsam.noiseModel.mEstimator.Huber,
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
+    "dcs": gtsam.noiseModel.mEstimator.DCS,
     "geman-mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
     "tukey": gtsam.noiseModel.mEstimator.Tukey,
 }

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
+from factorbus.cli.commands.suspects import suspects_command
 from factorbus.cli.output.advice import advising, of_what_is_there
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import FAILED, OK, input_file
@@ -319,6 +320,9 @@ def repair_command(
         title=f"At revision {found.revision}, in {found.seconds:.2f} s",
     )
     return OK
+
+
+command.add_command(suspects_command, "suspects")
 
 
 def _variable_rows(explained: Any) -> list[tuple[str, str]]:

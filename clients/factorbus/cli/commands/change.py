@@ -92,6 +92,34 @@ def weigh_command(address: MapAddress, weight: float, factors: tuple[int, ...], 
     return _make(address, Changes().weigh(factors, weight), **how)
 
 
+@command.command("accept")
+@_changing
+@click.argument("factors", nargs=-1, required=True, type=int)
+def accept_command(address: MapAddress, factors: tuple[int, ...], **how: Any) -> int:
+    """Have loop closures in the estimate, for good, whatever the map thinks of them (`factorbus ask suspects`).
+
+    \b
+    factorbus change accept warehouse 21
+    """
+    from factorbus.client import Changes
+
+    return _make(address, Changes().accept(factors), **how)
+
+
+@command.command("reject")
+@_changing
+@click.argument("factors", nargs=-1, required=True, type=int)
+def reject_command(address: MapAddress, factors: tuple[int, ...], **how: Any) -> int:
+    """Take loop closures out of the estimate, for good; `accept` puts them back.
+
+    \b
+    factorbus change reject warehouse 21 22
+    """
+    from factorbus.client import Changes
+
+    return _make(address, Changes().reject(factors), **how)
+
+
 @command.command("fix")
 @_changing
 @click.argument("keys", nargs=-1, required=True)

@@ -59,6 +59,7 @@ class ReplayRequest:
     strict: bool = False
     robot: RobotOptions | None = None
     rate: float | None = None
+    closures: str | None = None
 
     @property
     def where(self) -> str:
@@ -86,6 +87,11 @@ class ReplayRequest:
 )
 @click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
 @mode_option
+@click.option(
+    "--closures",
+    type=click.Choice(("trust", "test")),
+    help="Believe the file's loop closures, or test each as it comes.",
+)
 @click.option(
     "--every",
     type=click.IntRange(0),
@@ -154,6 +160,8 @@ def command(as_json: bool, **asked: Any) -> None:
     check_kind(request.file)
     if request.in_process and request.connect:
         raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
+    if request.in_process and request.closures == "test":
+        raise click.UsageError("--in-process and --closures test exclude each other: a map on the bus tests closures")
     if request.in_process and request.live:
         raise click.UsageError("--in-process and --live exclude each other: the page looks at a map on the bus")
     from factorbus.cli.output import console as screen
@@ -275,7 +283,8 @@ def _target(request: ReplayRequest) -> Iterator[Any]:
         )
         if solver is not None:
             solver.when_ended(bus.close)
-        joined = stack.enter_context(bus.map(request.map_name, mode=request.mode, window=request.window))
+        how = {"mode": request.mode, "window": request.window, "closures": request.closures}
+        joined = stack.enter_context(bus.map(request.map_name, **how))
         if joined.estimate.revision > 0:
             raise Stopped(
                 "map_not_empty",

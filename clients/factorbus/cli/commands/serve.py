@@ -43,6 +43,11 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
     "--upstream", metavar="ENDPOINT", help="Be a replica of the service there, and go on without it (see below)."
 )
 @click.option("--upstream-zenoh", metavar="FILE.json5", help="Zenoh configuration for it: TLS, user (deploy/zenoh).")
+@click.option(
+    "--closures",
+    type=click.Choice(("trust", "test")),
+    help="Of new maps: believe loop closures, or test each when it comes.  [default: trust]",
+)
 @click.option("--standby", is_flag=True, default=None, help="Wait until the journal's owner is gone, and take over.")
 @click.option("--name", metavar="NAME", help="Of this service, as the bus sees it.  [default: made up]")
 @click.option("--warm/--no-warm", default=None, help="Compile every kernel before the first insert.  [default: warm]")

@@ -96,10 +96,17 @@ def _map(row: Mapping[str, Any]) -> str:
         f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
         f"{inserts['busy']} answered busy; {row['waiting']} waiting, {row['parked']} parked; "
         f"{counted(row['clients'], 'client')}",
+        *([_closures(row["closure_states"])] if "closure_states" in row else []),
         *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
         *(f"journal {name}: {value}" for name, value in shown_fields(row.get("journal", {}))),
     ]
     return "\n".join(lines)
+
+
+def _closures(states: Mapping[str, int]) -> str:
+    """How many loop closures are in each state."""
+    told = ", ".join(f"{count} {state}" for state, count in states.items())
+    return f"loop closures are tested: {told}"
 
 
 def interest_line(row: Mapping[str, Any]) -> str:

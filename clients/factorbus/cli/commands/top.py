@@ -98,6 +98,7 @@ def view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType":
 # Columns of each table, the first of which stays; where not all have room the last of these goes first.
 _MATTER = (
     "variables", "revision", "χ²", "step ms", "waiting", "steps/s", "factors", "inserts", "map", "inserts/s", "refused",
+    "suspects",
     "mode", "slots", "in flight", "latency ms", "bytes/s", "at most", "upstream", "rebased", "link", "behind",
 )  # fmt: skip
 _ANY_WIDTH = 10_000
@@ -107,7 +108,8 @@ _Table = tuple[tuple[str, ...], list[tuple[str, ...]]]  # names of columns, rows
 
 def _maps(seen: dict[str, Any]) -> _Table:
     names = (
-        "map", "mode", "variables", "factors", "revision", "steps/s", "inserts/s", "step ms", "χ²", "waiting", "refused"
+        "map", "mode", "variables", "factors", "revision", "steps/s", "inserts/s", "step ms", "χ²", "waiting",
+        "refused", "suspects",
     )  # fmt: skip
     rows = [
         (
@@ -122,10 +124,18 @@ def _maps(seen: dict[str, Any]) -> _Table:
             f"{row['chi2']:.6g}" + _convergence(row),
             f"{row['waiting']}" + (f" +{row['parked']}" if row["parked"] else ""),
             f"{row['refused']}" + (f", {row['busy']} busy" if row["busy"] else ""),
+            _suspects(row),
         )
         for row in seen["maps"]
     ]
+    if not any(row["closure_states"] for row in seen["maps"] if "closure_states" in row):
+        return names[:-1], [row[:-1] for row in rows]  # no map tests closures
     return names, rows
+
+
+def _suspects(row: dict[str, Any]) -> str:
+    states = row.get("closure_states")
+    return "" if states is None else f"{states['suspect']} of {sum(states.values())}"
 
 
 def _convergence(row: dict[str, Any]) -> str:

@@ -65,6 +65,7 @@ class Indicators:
                 "gave_up": stats["gave_up"],
                 "refused": stats["inserts"]["refused"],
                 "busy": stats["inserts"]["busy"],
+                **({"closure_states": stats["closure_states"]} if "closure_states" in stats else {}),  # where tested
                 **({"upstream": stats["upstream"]} if "upstream" in stats else {}),  # of a replica
             }
         )

@@ -22,6 +22,13 @@ export function factorActs(factors) {
   );
 }
 
+// Of a closure that the map tests, and that the estimate does not have.
+export function suspectActs({ id, state }) {
+  const acts = [button("accept", () => edit({ edit: "accept_closures", factors: [id] }), "in the estimate, for good")];
+  if (state !== "rejected") acts.push(button("reject", () => edit({ edit: "reject_closures", factors: [id] }), "out of the estimate, for good"));
+  return bar(...acts);
+}
+
 export function variableActs(keys, fixed, found = null) {
   const many = keys.length > 1 ? ` ${keys.length} variables` : "";
   const acts = [];
@@ -35,7 +42,8 @@ export function variableActs(keys, fixed, found = null) {
 }
 
 export function severalActs(keys, factors) {
-  return element("div", null, ...(factors.length ? [factorActs(factors)] : []), ...(keys.length ? [variableActs(keys, null)] : []));
+  const known = factors.filter((each) => !each.state); // suspects are no factors of the estimate
+  return element("div", null, ...(known.length ? [factorActs(known)] : []), ...(keys.length ? [variableActs(keys, null)] : []));
 }
 
 function trying(act) {

@@ -2,7 +2,11 @@
 
 import { Selection } from "./selection.js";
 
-export const NOTHING = { closures: { revision: 0, keys: [], misfit: [] }, ellipses: { revision: 0, keys: [], covariances: [] } };
+export const NOTHING = {
+  closures: { revision: 0, keys: [], misfit: [] },
+  ellipses: { revision: 0, keys: [], covariances: [] },
+  suspects: { revision: 0, closures: [] },
+};
 
 export const app = {
   map: null,

@@ -23,6 +23,7 @@ window.factorbus = {
   pixelThere: (key) => besides() && pixelIn(besides().map, besides().view, key),
   get closures() { return app.asked.closures; },
   get ellipses() { return app.asked.ellipses; },
+  get suspects() { return app.asked.suspects; },
   get session() { return app.session; },
 };
 
@@ -77,11 +78,12 @@ async function refresh() {
 // What can be selected beside variables; asked for when one clicks, and again when the map is another.
 async function edges() {
   const { map } = app;
-  if (app.edges.name === map.name && app.edges.revision === map.revision) return app.edges.list;
+  const suspects = app.asked.suspects.closures;
+  if (app.edges.name === map.name && app.edges.revision === map.revision) return [...app.edges.list, ...suspects];
   const found = await ask(`${mapPath(map.name)}/edges`);
   const list = found.factors.flatMap(({ kind, ids, keys }) => ids.map((id, i) => ({ id, kind, keys: keys[i] })));
   app.edges = { name: map.name, revision: found.revision, list };
-  return list;
+  return [...list, ...suspects];
 }
 
 async function clicked(x, y, event) {

@@ -2,7 +2,7 @@
 
 import { ask, mapPath } from "./api.js";
 import { app, element, of } from "./app.js";
-import { factorActs, severalActs, variableActs } from "./acts.js";
+import { factorActs, severalActs, suspectActs, variableActs } from "./acts.js";
 
 const STARTS = { values: "the map's own values", odometry: "composed odometry", rotations: "averaged rotations" };
 let newest = 0; // answers that come after a later click are dropped
@@ -56,12 +56,31 @@ function explain(key) {
   });
 }
 
-export function chooseFactor({ id, kind, keys }) {
-  app.selection.factor({ id, kind, keys }, false);
+export function chooseFactor(factor) {
+  app.selection.factor(factor, false);
   showSelection();
 }
 
-function explainFactor({ id, kind }) {
+// What the map thinks of a closure that it does not believe is known already.
+function explainSuspect({ id, kind, keys, state, reason, distance, chance, since }) {
+  newest += 1;
+  const said = {
+    "poses": keys.join(", "), state, reason,
+    "d²": distance === null ? "not looked at yet" : short(distance, 4),
+    "chance": chance === null ? "not looked at yet" : `${short(100 * chance, 2)} % of false ones would be as near`,
+    "since": `revision ${since}`,
+  };
+  of("panel").replaceChildren(
+    element("h2", `closure ${id}, ${kind.split("(")[0]}`),
+    element("dl", null, ...Object.entries(said).flatMap(([name, text]) => [element("dt", name), element("dd", text)])),
+    suspectActs({ id, state }),
+    element("p", null, "of ", ...keys.flatMap((key) => [link(key, () => choose(key)), " "])),
+  );
+}
+
+function explainFactor(factor) {
+  const { id, kind } = factor;
+  if (factor.state) return explainSuspect(factor);
   return showing(`factor ${id}, ${kind}`, `factors/${id}`, (found) => [
     element("h2", `factor ${found.id}, ${found.kind.split("(")[0]}`),
     element("dl", null, ...Object.entries(factorWords(found)).flatMap(([name, said]) => [element("dt", name), element("dd", said)])),

@@ -65,7 +65,7 @@ export class View {
     return pixels.slice(1).map((to, i) => [pixels[i], to]);
   }
 
-  draw(map, { closures, ellipses }, { selection = null, ghost = null, marks = [] } = {}) {
+  draw(map, { closures, ellipses, suspects }, { selection = null, ghost = null, marks = [] } = {}) {
     this.fit(map);
     const ratio = window.devicePixelRatio || 1;
     const { clientWidth: w, clientHeight: h } = this.canvas;
@@ -78,6 +78,7 @@ export class View {
     this.drawTouched(pen, map);
     this.drawEllipses(pen, map, ellipses);
     this.drawClosures(pen, map, closures);
+    this.drawSuspects(pen, map, suspects);
     for (const keys of map.tracks().values()) this.drawTrack(pen, map, keys);
     for (const [key, { kind }] of map.variables) {
       if (kind.startsWith("point")) this.dot(pen, map.placeOf(key), 3.5, colour("landmark"));
@@ -204,6 +205,24 @@ export class View {
       });
       pen.stroke();
     }
+  }
+
+  // Closures that the estimate does not have: dashed, and paler those that are out for good.
+  drawSuspects(pen, map, { closures }) {
+    pen.strokeStyle = colour("suspect");
+    pen.lineWidth = 1.2;
+    pen.setLineDash([5, 4]);
+    for (const { state, ...factor } of closures) {
+      pen.globalAlpha = state === "rejected" ? 0.35 : 1;
+      pen.beginPath();
+      for (const [from, to] of this.segments(map, factor)) {
+        pen.moveTo(...from);
+        pen.lineTo(...to);
+      }
+      pen.stroke();
+    }
+    pen.setLineDash([]);
+    pen.globalAlpha = 1;
   }
 
   // Each holds 95 % of where the variable may be, seen from here.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 from factorbus.proto.arrays import I64
+from factorbus.proto.closures import ClosureEntry
 from factorbus.proto.interest_codec import AskInterest
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Problem, without_frames
@@ -41,7 +42,8 @@ class Arrived(NamedTuple):
     """An insert came in, and waits for its answer.
 
     askers: everybody who waits with it (a client may ask again).  content: the message, or the problem with it when
-    only its sequence number could be read; such an insert takes its place in the sequence and is refused there.
+    only its sequence number could be read; such an insert takes its place in the sequence and is refused there; or
+    verdicts of the map itself.
     digest tells a repetition from another message of that number.  message: the bytes as they came, for the journal.
     """
 
@@ -51,14 +53,15 @@ class Arrived(NamedTuple):
     epoch: int
     size: int
     digest: int
-    content: Insert | ParsedInsert | Problem
+    content: Insert | ParsedInsert | Problem | Any
     now: float
     message: bytes = b""
 
     @property
     def is_change(self) -> bool:
         """Whether it changes what the map has, which is a step of its own."""
-        return isinstance(self.content, Insert) and bool(self.content.changes)
+        content = self.content
+        return isinstance(content, ClosureEntry) or (isinstance(content, Insert) and bool(content.changes))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,15 +89,25 @@ def refusal(insert: Arrived, problem: Exception) -> Outcome:
     return Outcome(insert, without_frames(problem))
 
 
+class MovedClosure(NamedTuple):
+    """A loop closure that is tested has another state, or is new and not believed; why."""
+
+    factor: int
+    state: str
+    reason: str
+
+
 class Verdict(NamedTuple):
     """The solver accepted or refused these inserts.
 
-    revision, together: of the step that took in those that were accepted, and how many they were.
+    revision, together: of the step that took in those that were accepted, and how many they were.  closures: whose
+    state is another.
     """
 
     outcomes: tuple[Outcome, ...]
     revision: int = 0
     together: int = 0
+    closures: tuple[MovedClosure, ...] = ()
 
 
 class Stepped(NamedTuple):
@@ -121,7 +134,8 @@ class Stepped(NamedTuple):
 class Applied(NamedTuple):
     """The solver is done with an InsertBatch; how large the map is now, and what its thread has used.
 
-    refused: a further step was, and the map is where it was.
+    refused: a further step was, and the map is where it was.  closures: how many are in each state, where they are
+    tested.
     """
 
     variables: int
@@ -129,6 +143,7 @@ class Applied(NamedTuple):
     solver_cpu_s: float
     now: float
     refused: bool = False
+    closures: Mapping[str, int] | None = None
 
 
 class SingleInsertResult(NamedTuple):
@@ -143,7 +158,7 @@ class Restored(NamedTuple):
     """How a map is that was here before.
 
     differs: why its journal, run again, may give other bits; empty: as far as is known it gives the same; None: it has
-    none.
+    none.  closures: as `Applied` has it.
     """
 
     revision: int
@@ -153,6 +168,14 @@ class Restored(NamedTuple):
     converged: bool = True
     unfinished: bool = False
     differs: str | None = None
+    closures: Mapping[str, int] | None = None
+
+
+def reproducible_fields(differs: str | None) -> dict[str, Any]:
+    """What the row of a map says of its journal."""
+    if differs is None:
+        return {}
+    return {"reproducible": False, "reason": differs} if differs else {"reproducible": True}
 
 
 # ---- what waits -------------------------------------------------------------------------------------------------

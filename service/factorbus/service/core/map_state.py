@@ -15,9 +15,11 @@ from dataclasses import replace
 from typing import Any
 
 from factorbus.proto import codec
+from factorbus.proto.closures import JUDGE
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core.admission import Admission
+from factorbus.service.core.closures import asked_outcomes, closures_moved
 from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
     Applied,
@@ -37,6 +39,7 @@ from factorbus.service.core.events import (
     Stepped,
     Tell,
     Verdict,
+    reproducible_fields,
 )  # fmt: skip
 from factorbus.service.core.pending_questions import Reads, is_graft
 from factorbus.service.core.statistics import InsertDone, MapStatistics
@@ -54,8 +57,8 @@ _ROUND_TRIP_S = 0.0002
 class MapCore:
     """The state of one map, short of its estimate.  Every method takes an event and returns effects, in order."""
 
-    def __init__(self, name: str, mode: str, epoch: int, limits: Limits, now: float) -> None:
-        self.name, self.mode, self.epoch = name, mode, epoch
+    def __init__(self, name: str, mode: str, epoch: int, limits: Limits, now: float, closures: str = "trust") -> None:
+        self.name, self.mode, self.epoch, self.closures = name, mode, epoch, closures
         self.revision = self.variables = self.factors = 0
         self.differs: str | None = None  # as `Restored` has it
         self._limits, self._created = limits, now
@@ -80,6 +83,7 @@ class MapCore:
         return {
             "name": self.name,
             "mode": self.mode,
+            "closures": self.closures,
             "epoch": self.epoch,
             "revision": self.revision,
             "variables": self.variables,
@@ -87,13 +91,8 @@ class MapCore:
             "state": "blocked" if self._admission.blocked else "open",
             "converged": self._converging.converged,
             "converging": self._converging.converging,
-            **self._reproducible(),
+            **reproducible_fields(self.differs),
         }
-
-    def _reproducible(self) -> dict[str, Any]:
-        if self.differs is None:
-            return {}
-        return {"reproducible": False, "reason": self.differs} if self.differs else {"reproducible": True}
 
     def created(self) -> list[Effect]:
         """The map is on the bus: new, or as it was before."""
@@ -143,9 +142,9 @@ class MapCore:
 
     def give_verdict(self, verdict: Verdict) -> list[Effect]:
         """The solver's word on some of what it has."""
-        effects: list[Effect] = []
-        self._unanswered -= len(verdict.outcomes)
-        for outcome in verdict.outcomes:
+        effects, asked = closures_moved(verdict, self.epoch), asked_outcomes(verdict)
+        self._unanswered -= len(asked)
+        for outcome in asked:
             self._unanswered_bytes -= outcome.insert.size
             effects += self._admission.answer(outcome.insert, outcome.answer)
             if isinstance(outcome.answer, bytes):
@@ -200,11 +199,12 @@ class MapCore:
         self, senders: Iterable[tuple[str, int, Iterable[tuple[int, int, object]]]], restored: Restored
     ) -> None:
         """The map was here before: what its clients have sent, and how it is."""
-        for name, following, answered in senders:
+        for name, following, answered in ((*sender,) for sender in senders if sender[0] != JUDGE):
             self._admission.restore(name, following, answered, self._created)
         self.revision, self.variables, self.factors, self._statistics.chi2 = restored[:4]
         self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2)
         self._moved_at, self.differs = restored.revision, restored.differs
+        self._statistics.closures = restored.closures
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
@@ -222,7 +222,7 @@ class MapCore:
         self, inserts: Iterable[tuple[str, int, int, object]], steps: Iterable[Stepped], now: float
     ) -> list[Effect]:
         """Records of another journal were applied: (client, number, digest, answer) of each insert; the steps made."""
-        effects = [effect for insert in inserts for effect in self._admission.note(*insert, now)]
+        effects = [effect for i in inserts if i[0] != JUDGE for effect in self._admission.note(*i, now)]
         for stepped in steps:
             effects += self.stepped(stepped)
         self._converging.hold(now)  # who sent them takes further steps, too, and sends those
@@ -248,8 +248,8 @@ class MapCore:
         return self._go_on([], applied.now)
 
     def _free(self, applied: Applied, taken: int) -> None:
-        self._running = None
-        self._ended = applied.now
+        self._running, self._ended = None, applied.now
+        self._statistics.closures = applied.closures
         self._converging.ended(applied.solver_cpu_s - self._solver_cpu_s, applied.now)
         seconds = self._ended - self._started
         self._admission.took(taken, seconds)

@@ -6,6 +6,7 @@ thread that brought it is let go, and waits for all that is done before.  Measur
 
 from bisect import bisect_left
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 # As many as may be noted before they are counted in any case; the clock comes four times a second.
@@ -33,6 +34,7 @@ class MapStatistics:
 
     def __init__(self) -> None:
         self.chi2 = 0.0  # as it was before what is noted
+        self.closures: Mapping[str, int] | None = None  # how many are in each state, where they are tested
         self._accepted = self._received = self._answered = self._published = 0
         self._refusals: Counter[str] = Counter()
         self._strategies: Counter[str] = Counter()
@@ -89,6 +91,7 @@ class MapStatistics:
             },
             "strategies": dict(self._strategies),
             "solver_ms": self._solver_ms,
+            **({} if self.closures is None else {"closure_states": dict(self.closures)}),
         }
 
     def for_operators(self) -> dict[str, Any]:

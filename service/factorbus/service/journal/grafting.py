@@ -19,6 +19,7 @@ from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Journal
 from factorbus.journal.rewriting import UpstreamPlace
 from factorbus.journal.store import open_store
 from factorbus.proto import codec
+from factorbus.proto.closures import JUDGE
 from factorbus.proto.messages import Insert
 from factorbus.proto.records import JournalPlace, SentInsert, SentRecord
 from factorbus.service.core.events import Stepped
@@ -179,7 +180,9 @@ class _Grafting:
         ids = [entry.first_factor for record in own for entry in record.entries if entry.first_factor >= 0]
         first, moved = min(ids, default=0), False
         for record in own:
-            entries = [entry for entry in record.entries if not self._is_there(entry, there)]
+            # Verdicts on closures are of the map as it was: what is new here is judged with the next closure.
+            own_inserts = [entry for entry in record.entries if entry.client != JUDGE]
+            entries = [entry for entry in own_inserts if not self._is_there(entry, there)]
             if not entries and not record.further:
                 continue
             entries = [_again(entry, first if moved else None) for entry in entries]

@@ -18,6 +18,7 @@ from factorbus.journal.lock import Owned, own
 from factorbus.journal.problems import JournalDamaged, JournalOption, NoJournal, NotWritten
 from factorbus.journal.records import Epoch, Header, Maker
 from factorbus.journal.store import NAME, Checkpoint, Last, Store, create, open_store
+from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.nearest import nearest
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Config, Limits
@@ -25,7 +26,9 @@ from factorbus.service.core.map_state import MapCore, Restored
 from factorbus.service.journal.checkpoint_plan import CheckpointPlan
 from factorbus.service.journal.keeping import Keeper, Listener
 from factorbus.service.journal.recovery import Recovered, answers, recover
+from factorbus.service.questions.admin import check_made_as
 from factorbus.service.solving.apply import MapSolver
+from factorbus.service.solving.tested import TestedMapSolver
 from factorbus.solver.build import present_build
 from factorbus.solver.state import FORMAT
 
@@ -33,11 +36,17 @@ log = logging.getLogger(__name__)
 
 
 def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> MapSolver:
-    """A map solver with a new solver in `mode`, and the other settings as `options` has them.  Raises JournalOption."""
+    """A map solver with a new solver in `mode`, and the other settings as `options` has them.  Raises JournalOption.
+
+    closures: what becomes of loop closures, one of CLOSURE_POLICIES, is the map solver's own; by default they are
+    trusted.
+    """
     from factorbus.solver import Options, Solver
     from factorbus.solver.errors import BadOption
 
-    known = tuple(Options().as_dict())
+    known, options = tuple(Options().as_dict()), dict(options)
+    if (closures := options.pop("closures", "trust")) not in CLOSURE_POLICIES:
+        raise JournalOption("closures", f"it is {closures!r:.40}; wanted one of {', '.join(CLOSURE_POLICIES)}")
     for name in options:
         if name not in known:
             raise JournalOption(name, "there is no such option here" + nearest(name, known))
@@ -45,13 +54,21 @@ def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: L
         settings = Options.of(**{**options, "mode": mode, "clock": time.perf_counter})
     except BadOption as bad:
         raise JournalOption(str(bad.detail["where"]), bad.message) from None
+    if closures == "test":
+        return TestedMapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict() | {"closures": closures})
     return MapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict())
+
+
+def closure_policy_of(options: Mapping[str, Any]) -> str:
+    """What becomes of loop closures in a map with these settings."""
+    return str(options.get("closures", "trust"))
 
 
 def restored(map_solver: MapSolver, differs: str | None = None) -> Restored:
     """How the map in `map_solver` is.  differs: as `Restored` has it."""
     chi2 = map_solver.chi2() if map_solver.revision else 0.0
-    return Restored(map_solver.revision, *map_solver.size, chi2, map_solver.converged, map_solver.unfinished, differs)
+    done = map_solver.converged, map_solver.unfinished, differs
+    return Restored(map_solver.revision, *map_solver.size, chi2, *done, map_solver.closure_counts())
 
 
 def log_owner(owner: str) -> None:
@@ -92,30 +109,28 @@ class Library:
         """Whether a new map cannot have this name: there is one, or a folder that is something else."""
         return (self._owned.folder / name).exists()
 
-    def mode(self, name: str) -> str:
-        """The mode that map `name` was made in.  Raises JournalDamaged, JournalVersion."""
-        store = open_store(self._owned.folder / name, read_only=True)
-        try:
-            return store.header().mode
-        finally:
-            store.close()
-
-    def make(self, name: str, mode: str, limits: Limits) -> "Kept":
+    def make(self, name: str, mode: str, limits: Limits, closures: str = "trust") -> "Kept":
         """A new map, and its journal.  Raises JournalFailed."""
         where, epoch = self._owned.folder / name, secrets.randbits(62) | 1
-        map_solver = make_map_solver(mode, {}, epoch, limits)
+        map_solver = make_map_solver(mode, {"closures": closures}, epoch, limits)
         store = create(where, name, mode, map_solver.options(), epoch, self._config.durability)
         return Kept(store, store.header(), map_solver, Recovered(store.last()), self._config)
 
-    def open(self, name: str, limits: Limits) -> "Kept":
-        """The map `name` as it was.  Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed."""
+    def open(self, name: str, limits: Limits, mode: str | None = None, closures: str = "") -> "Kept":
+        """The map `name` as it was, if it was made in that mode with that policy; None, "": whichever.
+
+        Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed, OtherMode, OtherClosures.
+        """
         path = self._owned.folder / name
         try:
             store = open_store(path, self._config.durability)
         except NoJournal:
             raise JournalDamaged(path, f"{NAME} is missing beside what was written with it") from None
         try:
-            return _reopened(store, limits, self._config)
+            store.check_form()
+            header = store.header()
+            check_made_as(name, (header.mode, closure_policy_of(header.options)), mode, closures)
+            return _reopened(store, header, limits, self._config)
         except Problem:
             store.close()
             raise
@@ -223,10 +238,8 @@ def open_library(config: Config, waiting: Callable[[str], None], stop: Any) -> L
     return Library(owned, config) if owned is not None else None
 
 
-def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
+def _reopened(store: Store, header: Header, limits: Limits, config: Config) -> Kept:
     started = time.perf_counter()
-    store.check_form()
-    header = store.header()
     map_solver = make_map_solver(header.mode, header.options, header.epoch, limits)
     recovered = recover(store, map_solver)
     if store.writable:

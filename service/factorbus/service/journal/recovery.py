@@ -20,9 +20,11 @@ from factorbus.journal.problems import JournalDiffers
 from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, JournalRecord, Sender
 from factorbus.journal.store import Checkpoint, Last, Store
 from factorbus.proto import codec
+from factorbus.proto.closures import JUDGE, decode_closure_entry
 from factorbus.service.core.events import Arrived, Verdict
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import message_digest, read_again
+from factorbus.service.solving.tested import entry_again
 from factorbus.solver.build import differences, present_build
 from factorbus.solver.errors import SolverError
 from factorbus.solver.state import FORMAT
@@ -177,5 +179,7 @@ def _why_it_differs(saved: Checkpoint | None, other: str, compared: int, differs
 
 def arrived_again(entry: Entry) -> Arrived:
     """An insert as it came, without anybody who waits for its answer."""
+    if entry.client == JUDGE:
+        return entry_again(entry.message, decode_closure_entry(entry.message))
     digest, content = read_again(entry.message)
     return Arrived([], entry.client, entry.sequence, 0, len(entry.message), digest, content, 0.0, entry.message)

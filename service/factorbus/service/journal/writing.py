@@ -24,8 +24,23 @@ def written(
         else:
             present, revision = chain.extend_chain(present, event.delta), event.revision
             rebuilt = rebuilt or event.rebuilt
-    entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
+    entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in _with_judged(inserts, events))
     return JournalRecord(number, revision, rebuilt, present, entries, further and not rebuilt)
+
+
+def _with_judged(inserts: Sequence[Arrived], events: Sequence[Verdict | Stepped]) -> list[Arrived]:
+    """The inserts, and behind each the verdicts on closures that it brought about: so they are applied again.
+
+    Inserts that come from a journal have theirs among them.
+    """
+    given, behind, last = {id(insert) for insert in inserts}, dict[int, list[Arrived]](), 0
+    for event in events:
+        for outcome in event.outcomes if isinstance(event, Verdict) else ():
+            if id(outcome.insert) in given:
+                last = id(outcome.insert)
+            else:
+                behind.setdefault(last, []).append(outcome.insert)
+    return [each for insert in inserts for each in (insert, *behind.get(id(insert), ()))]
 
 
 def _entry(insert: Arrived, outcome: Outcome, verdict: Verdict) -> Entry:

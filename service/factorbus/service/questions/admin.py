@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from factorbus.proto import codec, fields
+from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.problems import BadMessage, Problem
@@ -17,6 +18,19 @@ class OtherMode(Problem):
 
     def __init__(self, name: str, mode: str, wanted: str) -> None:
         super().__init__(f"map {name!r} is in mode {mode}, not {wanted}; join it as {mode} or drop it", mode=mode)
+
+
+class OtherClosures(Problem):
+    """The map is there, and treats loop closures otherwise than asked for."""
+
+    code = "other_closures"
+
+    def __init__(self, name: str, closures: str, wanted: str) -> None:
+        super().__init__(
+            f"map {name!r} has the policy {closures!r} for loop closures, not {wanted!r}, and keeps it; join it with "
+            "that, or drop it",
+            closures=closures,
+        )
 
 
 class MovedOn(Problem):
@@ -89,10 +103,16 @@ class Fork(NamedTuple):
     request: int = 0
 
 
-def read_create(payload: bytes) -> tuple[str, str]:
-    """(map, mode) of an admin/create.  Raises BadMessage, BadOption, BadName, TooLarge."""
+def read_create(payload: bytes) -> tuple[str, str, str]:
+    """(map, mode, closures) of an admin/create; closures "": whichever.
+
+    Raises BadMessage, BadOption, BadName, TooLarge.
+    """
     content = codec.decode_map(payload, REQUEST_LIMITS, what="create")
-    return _map_name(content, "create"), fields.choice_of("create", content, "mode", tuple(MODES), "auto")
+    mode, closures = fields.choice_of("create", content, "mode", tuple(MODES), "auto"), ""
+    if content.get("closures") is not None:
+        closures = fields.choice_of("create", content, "closures", CLOSURE_POLICIES, "")
+    return _map_name(content, "create"), mode, closures
 
 
 class Drop(NamedTuple):
@@ -118,6 +138,17 @@ def read_fork(payload: bytes) -> Fork:
     content = codec.decode_map(payload, REQUEST_LIMITS, what="fork")
     request = fields.integer("fork", content, "request", default=0)
     return Fork(_map_name(content, "fork"), _map_name(content, "fork", "as"), request)
+
+
+def check_made_as(name: str, made_as: tuple[str, str], mode: str | None, closures: str) -> None:
+    """Is map `name`, of that mode and policy, as it is asked for?  None, "": whichever.
+
+    Raises OtherMode, OtherClosures.
+    """
+    if mode not in (None, made_as[0]):
+        raise OtherMode(name, made_as[0], mode)
+    if closures not in ("", made_as[1]):
+        raise OtherClosures(name, made_as[1], closures)
 
 
 def settled_mode(mode: str) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from factorbus.proto import codec, fields
 from factorbus.proto.arrays import I64
 from factorbus.proto.asking import AskRepair, Repaired
+from factorbus.proto.closures import decode_ask_suspects
 from factorbus.proto.interest import InterestFilter
 from factorbus.proto.interest_codec import decode_ask_interest, read_filter
 from factorbus.proto.keys import QUESTIONS
@@ -100,6 +101,8 @@ def parse(name: str, payload: bytes) -> Question:
         return Question(name, ask=DECODE[name](payload))
     if name == "repair":
         return Question(name, ask=decode_ask_repair(payload))
+    if name == "suspects":
+        return Question(name, ask=decode_ask_suspects(payload))
     if name == "interest":
         return Question(name, ask=decode_ask_interest(payload))
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")

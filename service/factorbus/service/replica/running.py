@@ -296,7 +296,7 @@ class Replicas:
 
     def _join(self, followed: _Followed, effect: JoinUpstream) -> None:
         core = followed.host.core
-        payload = codec.encode_map({"map": core.name, "mode": core.mode})
+        payload = codec.encode_map({"map": core.name, "mode": core.mode, "closures": core.closures})
         self._query(followed, effect.number, keys.admin_key("create"), payload)
 
     def _ask(self, followed: _Followed, effect: AskUpstream) -> None:

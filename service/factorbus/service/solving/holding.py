@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from factorbus.proto.closures import Suspects, encode_suspects
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Stepped
@@ -73,8 +74,19 @@ class Holding:
             self._solver, self._epoch, self._revision, questions, self._last_report, self._uncertain, self._room
         )
         self._uncertain = taken.uncertain
+        if asked := {id(q): self.suspects(q.ask.every) for q in questions if q.name == "suspects"}:
+            taken = replace(taken, ready={**taken.ready, **asked})
         rooms = [question.ask.room for question in questions if question.name == "copy"]
         return replace(taken, copied=self._copied(min(rooms))) if rooms else taken
+
+    def closure_counts(self) -> dict[str, int] | None:
+        """How many loop closures are in each state; None: they are not tested."""
+        return None
+
+    def suspects(self, every: bool) -> bytes:
+        """The answer to ask/suspects; `every`: of all closures.  Where they are not tested there are none."""
+        del every
+        return encode_suspects(Suspects(self._epoch, self._revision, "trust"))
 
     def options(self) -> dict[str, Any]:
         """The settings of its solver."""

@@ -11,6 +11,7 @@
                                                         places goes along with what it hangs on (`carrying`)
     marginalize        keys (n,)                        these variables go; what their factors say of others is kept as
                                                         linear factors (`marginal`)
+    accept, reject     factors (n,)                     of closures that are tested: `closures.switching` makes them
 
 Changes are made one after the other: what the first has removed the second cannot name.  Each names what it is about
 once.
@@ -26,6 +27,7 @@ from factorbus.proto import kinds as wire
 from factorbus.solver import errors
 from factorbus.solver.changes.carrying import carry_along
 from factorbus.solver.changes.marginal import marginals
+from factorbus.solver.closures.ledger import NotAClosure
 from factorbus.solver.graph.admission import out_of_bounds
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, losses_of, of_whole_factors, rows_of_factors
@@ -36,7 +38,18 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_INFORMATION, LEAST_SCALE, MOST_INFORMATION, MOST_NUMBER
 
-CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place", "marginalize")
+CHANGES = (
+    "remove_factors",
+    "remove_variables",
+    "loss",
+    "weigh",
+    "fix",
+    "free",
+    "place",
+    "marginalize",
+    "accept",
+    "reject",
+)
 # A marginal is of the graph as it is: of what came before in the insert, it sees what is removed and nothing else.
 _BEFORE_MARGINALIZE = {"remove_factors", "remove_variables"}
 _NONE = np.empty(0, np.int64)
@@ -260,6 +273,13 @@ def _marginalize(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     edits.kept[replaced] = False
 
 
+def _override(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
+    """Of a map that tests closures: then it does not come to this."""
+    rows = _factors(graph, edits, change)
+    if rows.size:
+        raise NotAClosure(_id(graph, rows, np.zeros(1, np.int64)), 0)
+
+
 _MAKE = {
     "remove_factors": _remove_factors,
     "remove_variables": _remove_variables,
@@ -269,6 +289,8 @@ _MAKE = {
     "free": _free,
     "place": _place,
     "marginalize": _marginalize,
+    "accept": _override,
+    "reject": _override,
 }
 
 

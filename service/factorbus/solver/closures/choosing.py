@@ -1,19 +1,22 @@
 """Which of some closures are believed: each by itself, or several that agree.
 
-    passed       within the gate, where a false one would hardly be
+    passed       within the gate, and hardly so if it were false
     agrees       one of a set that agrees, as false ones do not by chance (below)
-    unsure       within the gate, and so would many a false one be
+    unsure       within the gate, and may well be false
     improbable   outside the gate
 
+How likely it is that one is false follows from the odds of its residual, times those of closures to be false at all.
+
 A set is the largest of which each two agree.  Chance is excluded twice.  Among n independent false closures, off by up
-to the policy's spread, C(n, m) Π p sets like it are expected: p for one to agree with one before it, over the tree of
-the least likely agreements.  And mistakes bring several closures with them, as two corridors that look alike do, and
-lead anywhere in the map: of n places C(n, m) q Π p agree, q for the first to be within the map's gate.
+to the policy's spread, C(n, m) Π p sets like it are expected: p the odds of one that agrees with one before it, over
+the tree of the least likely agreements.  And mistakes bring several closures with them, as two corridors that look
+alike do, and lead anywhere in the map: of n places C(n, m) q Π p agree, q the odds of the first one.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,40 +26,57 @@ from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.kernels.jit.compile import F64, I64
 
 PASSED, AGREES, UNSURE, IMPROBABLE = "passed", "agrees", "unsure", "improbable"
+LEAST_RIVALS = 3  # that agree, against what the map says
 _LEAST_CHANCE = 1e-12
 _MOST_BRANCHES = 20_000
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What each of n closures is: one of the reasons above; d², and the chance of a false one to be within the gate.
+    """What each of n closures is: one of the reasons above; d²; and the odds that it is false, even ones before: of its
+    residual, or of the set that is believed.
 
-    rivals: those outside the gate that agree with each other, at two places or more: the map may be wrong.
+    rivals: those outside the gate that agree with each other: the map may be wrong.
+    allowed (n, d, d): S of each.
     """
 
     reasons: list[str]
     distance: F64
     chance: F64
     rivals: list[int]
+    allowed: F64
 
 
-def choose_closures(c: ClosureNumbers, extent_m: float, policy: ClosurePolicy) -> Chosen:
-    """Judge `c`; extent_m: half the length of the map, where mistakes may lead."""
-    d = c.noise.shape[1]
-    probabilities = policy.closure_gate_probability, policy.closure_out_probability, policy.closure_set_probability
-    gate, out, nearest = (float(threshold(np.array([d]), p)[0]) for p in probabilities)
-    own = FalseSpread(policy.closure_spread_m, policy.closure_spread_rad)
+def choose_closures(c: ClosureNumbers, extent_m: float, policy: ClosurePolicy, odds: float = 1.0) -> Chosen:
+    """Judge `c`; extent_m: half the length of the map, where mistakes may lead; odds: of a closure to be false."""
+    gate, out, own = limits_of(policy, c.noise.shape[1])
     spreads = (own, FalseSpread(max(extent_m, own.metres), math.pi))
-    each = judge_each(c, gate, spreads)
+    each = judge_each(c, spreads)
     within = each.distance <= gate
-    sure = within & (each.chance[:, 0] <= policy.closure_chance_max)
+    sure = within & (odds * each.chance[:, 0] <= policy.closure_chance_max)
     reasons = [PASSED if s else UNSURE if w else IMPROBABLE for s, w in zip(sure, within, strict=True)]
     sets = _Sets(c, gate, spreads, policy)
-    members = sets.believed(np.flatnonzero(~sure & (each.distance <= out)), each.chance[:, 1])
-    if members and each.distance[members].min() <= nearest:
-        for k in members:
-            reasons[k] = AGREES
-    return Chosen(reasons, each.distance, each.chance[:, 0], sets.rivals(np.flatnonzero(~within)))
+    members, of_set = sets.believed(np.flatnonzero(~sure & (each.distance <= out)), odds * each.chance[:, 1])
+    chance = each.chance[:, 0].copy()
+    for k in members:
+        reasons[k], chance[k] = AGREES, min(of_set, chance[k])
+    return Chosen(reasons, each.distance, chance, sets.rivals(np.flatnonzero(~within)), each.allowed)
+
+
+class ClosureLimits(NamedTuple):
+    """What a policy comes to for residuals of some numbers: d² of the gate, and d² beyond which one is improbable
+    whatever agrees with it; how far off independent false ones are."""
+
+    gate: float
+    out: float
+    spread: FalseSpread
+
+
+def limits_of(policy: ClosurePolicy, dims: int) -> ClosureLimits:
+    """The limits of a policy."""
+    probabilities = policy.closure_gate_probability, policy.closure_out_probability
+    gate, out = (threshold(np.array([dims]), probability).item() for probability in probabilities)
+    return ClosureLimits(gate, out, FalseSpread(policy.closure_spread_m, policy.closure_spread_rad))
 
 
 class _Sets:
@@ -68,14 +88,14 @@ class _Sets:
     def __init__(self, c: ClosureNumbers, gate: float, spreads: Sequence[FalseSpread], policy: ClosurePolicy) -> None:
         n = len(c.z)
         i, j = np.triu_indices(n, 1)
-        pairs = judge_pairs(c, i, j, gate, spreads)
+        pairs = judge_pairs(c, i, j, spreads)
         self.agree, self.chance = np.zeros((n, n), bool), np.ones((n, n, len(spreads)))
         self.agree[i, j] = self.agree[j, i] = pairs.distance <= gate
         self.chance[i, j] = self.chance[j, i] = pairs.chance
         self.places, self.policy = closure_places(c, policy.closure_place_m), policy
 
-    def believed(self, among: I64, alone: F64) -> list[int]:
-        """The largest one among some, or none where it may be chance; alone (n,): the chance of each, anywhere.
+    def believed(self, among: I64, alone: F64) -> tuple[list[int], float]:
+        """The largest one among some, or none where it may be chance, and its odds; alone (n,): of each, anywhere.
 
         Of each member one other says so well where it is that a false one would hardly agree.
         """
@@ -86,7 +106,7 @@ class _Sets:
                 break
             members = members[sure]
         if members.size < 2:
-            return []
+            return [], 1.0
         chance, own = self.chance[np.ix_(members, members)], self.places[members]
         there = np.unique(own)
         # Of two places the two that are the least likely to agree.
@@ -94,12 +114,12 @@ class _Sets:
         logarithm = _chain(between) + math.log(max(float(alone[members].min()), _LEAST_CHANCE))
         by_mistake = _expected(np.unique(self.places[among]).size, there.size, logarithm)
         is_sure = self._is_set(members, among.size) and by_mistake <= self.policy.closure_chance_max
-        return members.tolist() if is_sure else []
+        return (members.tolist(), by_mistake) if is_sure else ([], 1.0)
 
     def rivals(self, among: I64) -> list[int]:
-        """The largest one among some, of two places or more, that is not by chance of independent ones."""
+        """The largest one among some, three or more, that is not by chance of independent ones."""
         members = self._largest(among)
-        if members.size < 3 or np.unique(self.places[members]).size < 2:
+        if members.size < LEAST_RIVALS:
             return []
         return members.tolist() if self._is_set(members, among.size) else []
 

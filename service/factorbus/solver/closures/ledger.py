@@ -1,91 +1,169 @@
-"""All closures of one kind that a map was given, as columns, and what has become of each."""
+"""All closures that a map was given, as columns, and what has become of each.
 
+A closure that is not believed keeps its factor's id, and is no factor of the map meanwhile: it is kept here.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from factorbus.solver.closures.choosing import IMPROBABLE
 from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.errors import SolverError
-from factorbus.solver.graph.factor_graph import with_room
+from factorbus.solver.graph.factor_graph import FactorGraph, with_room
 from factorbus.solver.graph.groups import FactorGroup, FactorsLike
 from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.wording import counted
 
 ACCEPTED, SUSPECT, REJECTED, RESTORED = "accepted", "suspect", "rejected", "restored"
-NEW = "new"
+CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
+NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
-_COLUMNS = ("z", "noise", "weight", "ends", "looked", "is_suspect", "is_tested")
+BELIEVED = {ACCEPTED, RESTORED}
+_COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_new", "is_tested", "is_improbable")
 
 
 @dataclass(slots=True, eq=False)
 class Closure:
     """One closure.
 
-    number: in the order they came, of all kinds; row: in its ledger.  came, changed, looked: steps, when it came, when
-    its state last changed, when it was last looked at.  reason: why its state is what it is.  distance: d², chance: of
-    a false one to be within the gate, both when it was last looked at.  factor_id: in the solver, −1: it has none.
+    factor_id: its id, whether it is in or not; row: in its ledger.  came, changed: revisions, when it came, and when
+    its state last changed.  reason: why its state is what it is.  distance: d², chance: the odds of its residual, both
+    when it was last looked at.  tried: the newest rival when it was last taken out on trial.
     """
 
-    number: int
+    factor_id: int
     row: int
     factor: FactorGroup
     came: int
     state: str = SUSPECT
-    reason: str = "new"
+    reason: str = NEW
     distance: float = float("nan")
     chance: float = float("nan")
     changed: int = 0
-    looked: int = 0
-    factor_id: int = -1
+    tried: int = -1
 
     @property
     def is_in(self) -> bool:
         """Whether the estimate has it."""
-        return self.factor_id >= 0
+        return self.state in BELIEVED
+
+    @property
+    def keys(self) -> tuple[int, int]:
+        """The poses it is between."""
+        first, second = self.factor.keys[0].tolist()
+        return first, second
 
 
-class UnknownClosure(SolverError):
-    """A number that no closure has."""
+class NotAClosure(SolverError):
+    """A factor that is no closure which the map tests."""
 
-    code = "unknown_closure"
+    code = "not_a_closure"
 
-    def __init__(self, number: int, count: int) -> None:
-        have = f"they are 0 to {count - 1}" if count else "there is none yet"
-        super().__init__(f"there is no closure {number}: {have}; `closures` has them", closure=number)
+    def __init__(self, factor: int, count: int) -> None:
+        have = f"it tests {counted(count, 'closure')}, which ask/suspects lists" if count else "it tests none so far"
+        super().__init__(f"factor {factor} is no loop closure that the map tests: {have}", factor=factor)
+
+
+class SwitchedOff(SolverError):
+    """A change of a closure that is not in the estimate."""
+
+    code = "switched_off"
+
+    def __init__(self, change: str, factor: int, state: str) -> None:
+        super().__init__(
+            f"{change}: factor {factor} is a loop closure that the estimate does not have ({state}); accept it first, "
+            "or remove it",
+            factor=factor, state=state,
+        )  # fmt: skip
+
+
+class ClosureVerdicts(NamedTuple):
+    """What closures are from now on, each (n,): ids, states, reasons, d², chances, and rivals that were tried."""
+
+    factors: I64
+    states: tuple[str, ...]
+    reasons: tuple[str, ...]
+    distance: F64
+    chance: F64
+    tried: I64
 
 
 class Ledger:
     """Closures of one kind.
 
-    z (n, k, k), noise, weight (n, d, d): what was measured, Ω⁻¹ and Ω in its tangent space, metres and radians.
-    ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out.
-    looked (n,): the step.  All have room behind for more.
+    z (n, k, k), noise (n, d, d): what was measured, and Ω⁻¹ in its tangent space, metres and radians.
+    bound (n, d, d): rᵀ W r is no less than d² of one that is in, and no more than that of a suspect, for as long as the
+    map only gets factors, to first order; NaN: not known.  Nothing but work depends on it.
+    ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out;
+    is_new, is_improbable (n,): a suspect for that reason; accepted, improbable: how many are in, and are that.
+    looked (n,): when it was last looked at, in looks.  All columns have room behind for more.
     """
 
     def __init__(self, kind: str) -> None:
         self.kind, self.size, self.dim = kind, POSES_BETWEEN[kind], 3 if kind == "between_se2" else 6
         self.closures: list[Closure] = []
         k, d = 3 if self.dim == 3 else 4, self.dim
-        self.z, self.noise, self.weight = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
+        self.z, self.noise, self.bound = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
         self.ends, self.looked = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
-        self.is_suspect, self.is_tested = np.zeros(0, bool), np.zeros(0, bool)
+        self.is_suspect, self.is_new, self.is_tested, self.is_improbable = (np.zeros(0, bool) for _ in range(4))
+        self.accepted = self.improbable = 0
 
-    def add(self, factor: FactorGroup, number: int, ends: I64, step: int) -> Closure:
-        """One more; a suspect at first."""
-        n = len(self.closures)
-        if n == len(self.z):
+    def add(self, closure: Closure, ends: Sequence[int], looked: int) -> None:
+        """One more."""
+        n = closure.row = len(self.closures)
+        self._make_room(n + 1)
+        self.closures.append(closure)
+        self.ends[n], self.looked[n] = ends, looked
+        self.mark(closure)
+        self.measure(closure, closure.factor)
+
+    def enter(self, new: Sequence[Closure], ends: I64, looked: int, z: F64, noise: F64, bound: F64) -> None:
+        """Several more, of which these columns are known."""
+        n, count = len(self.closures), len(self.closures) + len(new)
+        self._make_room(count)
+        self.ends[n:count], self.looked[n:count] = ends, looked
+        self.z[n:count], self.noise[n:count], self.bound[n:count] = z, noise, bound
+        for row, closure in enumerate(new, n):
+            closure.row = row
+            self.is_suspect[row] = self.is_new[row] = closure.state == SUSPECT
+            self.is_tested[row] = closure.state == ACCEPTED
+            self.accepted += closure.state == ACCEPTED
+        self.closures += new
+
+    def _make_room(self, need: int) -> None:
+        if need > len(self.z):
             for name in _COLUMNS:
-                setattr(self, name, with_room(getattr(self, name), n + 1))
-        self.z[n] = motions_of_poses(factor.measured)[0]
-        self.noise[n], self.weight[n] = _certainty(factor, self.dim)
-        self.ends[n], self.looked[n] = ends, step
-        self.closures.append(Closure(number, n, factor, step))
-        self.move(self.closures[n], SUSPECT, NEW, step)
-        return self.closures[n]
+                setattr(self, name, with_room(getattr(self, name), need))
 
-    def move(self, closure: Closure, state: str, reason: str, step: int) -> None:
-        """Its state changes."""
-        closure.state, closure.reason, closure.changed = state, reason, step
-        self.is_suspect[closure.row], self.is_tested[closure.row] = state == SUSPECT, state == ACCEPTED
+    def measure(self, closure: Closure, factor: FactorGroup) -> None:
+        """What it measures, and how well."""
+        closure.factor = factor
+        self.z[closure.row] = motions_of_poses(factor.measured)[0]
+        self.noise[closure.row], self.bound[closure.row] = _noise(factor, self.dim), np.nan
+
+    def mark(self, closure: Closure) -> None:
+        """Its state has changed."""
+        row, is_suspect = closure.row, closure.state == SUSPECT
+        if self.is_suspect[row] and not is_suspect:  # Ω S Ω, of S when it was a suspect
+            weight = np.linalg.inv(self.noise[row])
+            self.bound[row] = weight @ np.linalg.inv(self.bound[row]) @ weight
+        elif self.is_suspect[row] != is_suspect:
+            self.bound[row] = np.nan
+        is_tested, is_improbable = closure.state == ACCEPTED, is_suspect and closure.reason == IMPROBABLE
+        self.accepted += is_tested - bool(self.is_tested[row])
+        self.improbable += is_improbable - bool(self.is_improbable[row])
+        self.is_suspect[row], self.is_tested[row], self.is_improbable[row] = is_suspect, is_tested, is_improbable
+        self.is_new[row] = is_suspect and closure.reason == NEW
+
+    def odds(self) -> float:
+        """Of a closure to be false, by those that have come (Laplace's rule), and even at most.
+
+        Improbable ones count as false, those that are in as right.
+        """
+        return min((1 + self.improbable) / (1 + self.accepted), 1.0)
 
     def suspects(self) -> I64:
         """Rows."""
@@ -95,6 +173,164 @@ class Ledger:
         """Rows."""
         return np.flatnonzero(self.is_tested[: len(self.closures)])
 
+    def unjudged(self) -> I64:
+        """Rows of suspects that nobody has looked at."""
+        return np.flatnonzero(self.is_new[: len(self.closures)])
+
+
+class ClosureLedger:
+    """All closures of a map, in the order in which they came.
+
+    looks: how often some were looked at.  moved_at: the look at which some went in or out last.
+    """
+
+    def __init__(self) -> None:
+        self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
+        self.of_factor: dict[int, Closure] = {}
+        self.looks = self.moved_at = 0
+        self._counts: dict[str, int] = dict.fromkeys(CLOSURE_STATES, 0)
+
+    @property
+    def closures(self) -> list[Closure]:
+        """All of them."""
+        return list(self.of_factor.values())
+
+    def counts(self) -> dict[str, int]:
+        """How many are in each state."""
+        return dict(self._counts)
+
+    def add(self, factor: FactorGroup, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
+        """A new one: a suspect that nobody has looked at."""
+        closure = Closure(factor_id, 0, factor, revision, changed=revision)
+        self.of_kind[factor.kind].add(closure, [graph.find(key) for key in closure.keys], self.looks)
+        self.of_factor[factor_id] = closure
+        self._counts[SUSPECT] += 1
+        return closure
+
+    def enter(self, kind: str, new: Sequence[Closure], ends: I64, z: F64, noise: F64, bound: F64) -> None:
+        """New ones of a kind, with their columns."""
+        self.of_kind[kind].enter(new, ends, self.looks, z, noise, bound)
+        self.of_factor |= {closure.factor_id: closure for closure in new}
+        for closure in new:
+            self._counts[closure.state] += 1
+
+    def named(self, factors: Iterable[int]) -> list[Closure]:
+        """Those with these ids.  Raises NotAClosure."""
+        found = []
+        for factor in factors:
+            if (closure := self.of_factor.get(factor)) is None:
+                raise NotAClosure(factor, len(self.of_factor))
+            found.append(closure)
+        return found
+
+    def said(self, factors: Iterable[int], state: str) -> ClosureVerdicts:
+        """That a user has the last word on these: `state` for good.  Raises NotAClosure."""
+        named = self.named(factors)
+        return verdicts_of((c, state, BY_USER, c.distance, c.chance, c.tried) for c in named)
+
+    def failed(self, verdicts: ClosureVerdicts) -> ClosureVerdicts:
+        """The same where the step that they asked for failed: what was to go in is a suspect, the rest stays."""
+        rows = []
+        for k, c in enumerate(self.named(verdicts.factors.tolist())):
+            state, reason = verdicts.states[k], verdicts.reasons[k]
+            if (state in BELIEVED) != c.is_in:
+                state, reason = (c.state, c.reason) if c.is_in else (SUSPECT, FAILED)
+            rows.append((c, state, reason, verdicts.distance[k], verdicts.chance[k], int(verdicts.tried[k])))
+        return verdicts_of(rows)
+
+    def note(self, verdicts: ClosureVerdicts, revision: int) -> list[Closure]:
+        """They are so from now on; gives those whose state is another than before.  Raises NotAClosure."""
+        self.looks += 1
+        changed, moved, lost = [], False, False
+        for k, c in enumerate(self.named(verdicts.factors.tolist())):
+            was, ledger = (c.state, c.is_in), self.of_kind[c.factor.kind]
+            c.state, c.reason, c.tried = verdicts.states[k], verdicts.reasons[k], int(verdicts.tried[k])
+            c.distance, c.chance = float(verdicts.distance[k]), float(verdicts.chance[k])
+            ledger.looked[c.row] = self.looks
+            ledger.mark(c)
+            if c.state != was[0]:
+                self._counts[was[0]] -= 1
+                self._counts[c.state] += 1
+                c.changed = revision
+                changed.append(c)
+            moved, lost = moved or c.is_in != was[1], lost or (was[1] and not c.is_in)
+        if moved:
+            self.moved_at = self.looks
+        for ledger in self.of_kind.values() if lost else ():
+            ledger.bound[:] = np.nan
+        return changed
+
+    def forget(self, gone: Iterable[int], graph: FactorGraph) -> None:
+        """Those with these ids are no more, and variables of the map may have other numbers."""
+        for factor in gone:
+            self._counts[self.of_factor.pop(factor).state] -= 1
+        looked = {c.factor_id: int(self.of_kind[c.factor.kind].looked[c.row]) for c in self.of_factor.values()}
+        self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
+        for c in self.of_factor.values():
+            self.of_kind[c.factor.kind].add(c, [graph.find(key) for key in c.keys], looked[c.factor_id])
+
+    def dump(self) -> dict[str, Any]:
+        """All of it, as plain values."""
+        all_ = self.closures
+        state: dict[str, Any] = {"looks": self.looks, "moved_at": self.moved_at}
+        for name in ("factor_id", "came", "changed", "tried"):
+            state[name] = np.array([getattr(c, name) for c in all_], np.int64)
+        for name in ("state", "reason"):
+            state[name] = [getattr(c, name) for c in all_]
+        state |= {name: np.array([getattr(c, name) for c in all_], np.float64) for name in ("distance", "chance")}
+        state["looked"] = np.array([self.of_kind[c.factor.kind].looked[c.row] for c in all_], np.int64)
+        state["kind"], state["loss"] = [c.factor.kind for c in all_], [c.factor.loss for c in all_]
+        scales = [c.factor.scale for c in all_]
+        state["scale"] = np.array([0.0 if scale is None else float(scale[0]) for scale in scales])
+        state["keys"] = np.array([c.keys for c in all_], np.int64).reshape(-1, 2)
+        for name in ("measured", "information"):
+            state[name] = np.concatenate([np.empty(0), *(getattr(c.factor, name)[0] for c in all_)])
+        return state
+
+    def load(self, state: Mapping[str, Any], graph: FactorGraph) -> None:
+        """Be what one was that gave `state`, of this graph.  Raises KeyError, ValueError."""
+        self.__init__()
+        self.looks, self.moved_at = int(state["looks"]), int(state["moved_at"])
+        here = {"measured": 0, "information": 0}
+        for k, kind in enumerate(state["kind"]):
+            numbers = []
+            for name, size in (("measured", 3 if kind == "between_se2" else 7), ("information", _TRIANGLES[kind])):
+                numbers.append(np.array(state[name][here[name] : here[name] + size]).reshape(1, size))
+                here[name] += size
+            loss = state["loss"][k]
+            scale = np.array([float(state["scale"][k])]) if loss else None
+            factor = FactorGroup(kind, np.array(state["keys"][k : k + 1]), numbers[0], numbers[1], loss, scale)
+            ids = [int(state[name][k]) for name in ("factor_id", "came", "changed", "tried")]
+            told = state["state"][k], state["reason"][k], float(state["distance"][k]), float(state["chance"][k])
+            closure = Closure(ids[0], 0, factor, ids[1], *told, ids[2], ids[3])
+            self.of_kind[kind].add(closure, [graph.find(key) for key in closure.keys], int(state["looked"][k]))
+            self.of_factor[closure.factor_id] = closure
+            self._counts[closure.state] += 1
+
+
+_TRIANGLES = {"between_se2": 6, "between_se3": 21}
+
+
+def verdicts_of(rows: Iterable[tuple[Closure, str, str, float, float, int]]) -> ClosureVerdicts:
+    """(closure, state, reason, d², chance, tried) of each, as columns."""
+    listed = list(rows)
+    return ClosureVerdicts(
+        np.array([row[0].factor_id for row in listed], np.int64),
+        tuple(row[1] for row in listed),
+        tuple(row[2] for row in listed),
+        np.array([row[3] for row in listed], np.float64),
+        np.array([row[4] for row in listed], np.float64),
+        np.array([row[5] for row in listed], np.int64),
+    )
+
+
+def pick_row(group: FactorsLike, k: int) -> FactorGroup:
+    """One factor of a group."""
+    own = slice(k, k + 1)
+    scale = None if group.scale is None else group.scale[own].copy()
+    picked = group.keys[own].copy(), group.measured[own].copy(), group.information[own].copy()
+    return FactorGroup(group.kind, *picked, group.loss, scale)
+
 
 def pick_rows(group: FactorsLike, chosen: np.ndarray | I64) -> FactorGroup:
     """Some factors of a group."""
@@ -103,12 +339,12 @@ def pick_rows(group: FactorsLike, chosen: np.ndarray | I64) -> FactorGroup:
     return FactorGroup(group.kind, *picked, group.loss, scale)
 
 
-def _certainty(factor: FactorGroup, d: int) -> tuple[F64, F64]:
-    """Ω⁻¹ and Ω in metres and radians: the residual of a rotation in space is half its angle."""
+def _noise(factor: FactorGroup, d: int) -> F64:
+    """Ω⁻¹ in metres and radians: the residual of a rotation in space is half its angle."""
     omega = np.zeros((d, d))
     rows, columns = np.triu_indices(d)
     omega[rows, columns] = omega[columns, rows] = factor.information[0]
     if d == 6:
         halves = np.array([1.0] * 3 + [0.5] * 3)
         omega *= halves[:, None] * halves
-    return np.asarray(np.linalg.inv(omega), np.float64), omega
+    return np.asarray(np.linalg.inv(omega), np.float64)

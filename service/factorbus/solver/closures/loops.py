@@ -1,14 +1,60 @@
 """Which factors of a batch close a loop: a relative pose between two variables that others join already.
 
-Relative poses between keys that follow each other, x6 and x7, are odometry, and are trusted.
+Relative poses between keys that follow each other, x6 and x7, are odometry, and are trusted; so are those that the
+client says are.
 """
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from factorbus.solver.closures.ledger import POSES_BETWEEN, pick_rows
+from factorbus.solver.closures.ledger import POSES_BETWEEN, pick_row, pick_rows
+from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import arities_of, is_first
 from factorbus.solver.graph.groups import BatchLike, FactorGroup, FactorsLike
+from factorbus.solver.kernels.jit.compile import I64
+from factorbus.solver.kernels.model import layout as at
 
 _GROUND = object()
+_NOWHERE: I64 = np.empty(0, np.int64)
+
+
+class SplitFactors(NamedTuple):
+    """The factors of a batch, how many there are, and those of them that close loops, one each.
+
+    closing_at: their places among all factors of the batch, ascending.
+    """
+
+    factors: Sequence[FactorsLike]
+    count: int
+    closing: list[FactorGroup]
+    closing_at: I64
+
+    @property
+    def trusted_at(self) -> I64:
+        """The places of those that are trusted."""
+        return np.delete(np.arange(self.count), self.closing_at)
+
+    @property
+    def trusted(self) -> list[FactorsLike]:
+        """Those that are trusted, in their order."""
+        if not self.closing:
+            return list(self.factors)
+        trusted, before = list[FactorsLike](), 0
+        is_trusted = np.ones(self.count, bool)
+        is_trusted[self.closing_at] = False
+        for group in self.factors:
+            own = is_trusted[before : before + len(group.keys)]
+            if own.any():
+                trusted.append(group if own.all() else pick_rows(group, own))
+            before += len(group.keys)
+        return trusted
+
+
+def has_candidates(batch: BatchLike) -> bool:
+    """Whether any factor of a batch may close a loop, whatever the map has."""
+    return any(not _are_trusted(group).all() for group in batch.factors)
 
 
 class TrustedForest:
@@ -19,34 +65,32 @@ class TrustedForest:
         self._sizes: dict[object, int] = {}
         self._linked: list[tuple[object, object]] = []  # by the last batch
 
-    def split(self, batch: BatchLike) -> tuple[list[FactorsLike], list[FactorGroup]]:
-        """The factors that are trusted, and those that close loops, one each, in their order."""
-        self._linked.clear()
-        for group in batch.variables:
-            if group.fixed:
-                for key in group.keys.tolist():
-                    self._join(_GROUND, key)
-        trusted, left = list[FactorsLike](), list[FactorsLike]()
+    def split(self, batch: BatchLike) -> SplitFactors:
+        """Join what trusted factors of a batch join; gives them, and those that close loops."""
+        self._begin(batch)
+        waiting, count = list[tuple[FactorsLike, int, int, int, int]](), 0
         for group in batch.factors:
-            is_trusted = np.ones(len(group.keys), bool)
-            if group.kind in POSES_BETWEEN:
-                is_trusted = np.abs(group.keys[:, 0] - group.keys[:, 1]) == 1
-            for row in group.keys[is_trusted].tolist():
-                for key in row[1:]:
-                    self._join(row[0], key)
-            if is_trusted.all():
-                trusted.append(group)
-                continue
-            if is_trusted.any():
-                trusted.append(pick_rows(group, is_trusted))
-            left.append(pick_rows(group, ~is_trusted))
-        closing: list[FactorGroup] = []
-        for group in left:
-            joins = np.array([self._join(i, j) for i, j in group.keys.tolist()], bool)
-            if joins.any():
-                trusted.append(pick_rows(group, joins))
-            closing += [pick_rows(group, np.array([k])) for k in np.flatnonzero(~joins).tolist()]
-        return trusted, closing
+            rows = group.keys.tolist()
+            if group.kind in POSES_BETWEEN and not getattr(group, "trusted", False):
+                for k, (i, j) in enumerate(rows):
+                    if -1 <= i - j <= 1 and i != j:
+                        self._join(i, j)
+                    else:
+                        waiting.append((group, k, count + k, i, j))
+            else:
+                self._join_rows(rows)
+            count += len(rows)
+        closing = [one for one in waiting if not self._join(one[3], one[4])]
+        if not closing:
+            return SplitFactors(batch.factors, count, [], _NOWHERE)
+        closing_at = np.array([one[2] for one in closing])
+        return SplitFactors(batch.factors, count, [pick_row(one[0], one[1]) for one in closing], closing_at)
+
+    def join(self, batch: BatchLike) -> None:
+        """Join what all factors of a batch join."""
+        self._begin(batch)
+        for group in batch.factors:
+            self._join_rows(group.keys.tolist())
 
     def forget(self) -> None:
         """As before the last batch, which was refused."""
@@ -54,6 +98,52 @@ class TrustedForest:
             self._above[under] = under
             self._sizes[over] -= self._sizes[under]
         self._linked.clear()
+
+    def renew(self, graph: FactorGraph) -> None:
+        """What hangs together by all factors of a graph, from which some may have gone."""
+        self.__init__()
+        keys = graph.keys[: graph.counts[at.VARIABLES]].tolist()
+        for v in np.flatnonzero(graph.var[: len(keys), at.V_COLUMN] < 0).tolist():
+            self._join(_GROUND, keys[v])
+        fac = graph.fac[: graph.counts[at.FACTORS]]
+        rows = np.flatnonzero(is_first(fac))
+        several = arities_of(fac[rows]) > 2
+        for i, j in fac[rows[~several], at.F_I : at.F_J + 1].tolist():
+            if j >= 0:
+                self._join(keys[i], keys[j])
+        for row in rows[several].tolist():
+            first, *others = graph.ends_of(row)
+            for v in others:
+                self._join(keys[first], keys[v])
+        self._linked.clear()
+
+    def dump(self) -> dict[str, Any]:
+        """Which keys hang together: of each the number of its part; ground: that of what is fixed, or −1."""
+        roots: dict[object, int] = {}
+        keys = [key for key in self._above if key is not _GROUND]
+        parts = [roots.setdefault(self._root(key), len(roots)) for key in keys]
+        ground = roots.get(self._root(_GROUND), -1) if _GROUND in self._above else -1
+        return {"keys": np.array(keys, np.int64), "parts": np.array(parts, np.int64), "ground": ground}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Be what one was that gave `state`.  Raises KeyError."""
+        self.__init__()
+        heads: dict[int, object] = {} if state["ground"] < 0 else {int(state["ground"]): _GROUND}
+        for key, part in zip(np.asarray(state["keys"]).tolist(), np.asarray(state["parts"]).tolist(), strict=True):
+            self._join(heads.setdefault(part, key), key)
+        self._linked.clear()
+
+    def _begin(self, batch: BatchLike) -> None:
+        self._linked.clear()
+        for group in batch.variables:
+            if group.fixed:
+                for key in group.keys.tolist():
+                    self._join(_GROUND, key)
+
+    def _join_rows(self, rows: Sequence[Sequence[int]]) -> None:
+        for row in rows:
+            for key in row[1:]:
+                self._join(row[0], key)
 
     def _join(self, one: object, other: object) -> bool:
         """Join two, the smaller under the larger; False: they are."""
@@ -73,3 +163,10 @@ class TrustedForest:
         while (higher := self._above[of]) != of:
             of = higher
         return of
+
+
+def _are_trusted(group: FactorsLike) -> np.ndarray:
+    """(m,): whether each is, whatever it joins."""
+    if group.kind not in POSES_BETWEEN or getattr(group, "trusted", False):
+        return np.ones(len(group.keys), bool)
+    return np.abs(group.keys[:, 0] - group.keys[:, 1]) == 1

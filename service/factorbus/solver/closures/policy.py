@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from factorbus.solver.errors import BadOption
 
 _SHARES = (
-    "closure_gate_probability", "closure_out_probability", "closure_set_probability", "closure_chance_max",
+    "closure_gate_probability", "closure_out_probability", "closure_chance_max",
     "closure_sets_max",
 )  # fmt: skip
 _SURE = 1e-12  # from 0 and 1: where quantiles of χ² are numbers that can be computed with
@@ -17,9 +17,8 @@ class ClosurePolicy:
 
     closure_gate_probability   a right closure is within the gate with this probability
     closure_out_probability    the same for one that the map has, or that agrees with others: beyond, it is improbable
-    closure_set_probability    the same for the one of a set that is nearest to where the map expects it
-    closure_chance_max         a closure is believed by itself where a false one is within the gate with at most this
-                               probability; and a set of them where as many sets at these places are expected
+    closure_chance_max         a closure is believed by itself where the odds that it is false are at most this; and a
+                               set of them where as many false sets at these places are expected
     closure_sets_max           sets like one that is believed, expected among independent false closures, at most
     closure_spread_m, closure_spread_rad   false closures are off by up to this along each axis, and about each
     closure_place_m            closures whose ends are within this of each other, metres, are of the same two places:
@@ -32,7 +31,6 @@ class ClosurePolicy:
 
     closure_gate_probability: float = 0.999
     closure_out_probability: float = 1.0 - 1e-6
-    closure_set_probability: float = 0.99
     closure_chance_max: float = 0.02
     closure_sets_max: float = 1e-3
     closure_spread_m: float = 5.0

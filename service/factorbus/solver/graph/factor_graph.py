@@ -5,7 +5,8 @@ A `Mark` is how much of everything was in use at some moment; `forget` goes back
 has been moved, so going back is setting counts and clearing the keys that came after.
 
 A factor's id is the number of factors that the map took in before it, and stays with it when others are removed: the
-ids of the first rows are listed, those of the rows behind them follow each other without gaps.
+ids of the first rows are listed, those of the rows behind them follow each other without gaps.  A closure that is put
+back has the last row, and the id it had.
 """
 
 from typing import Any, TypeAlias
@@ -76,7 +77,7 @@ class FactorGraph(Arenas):
         self.table: I64 = np.zeros(1024, np.int64)
         # No keys yet: it loads the kernel, which the step that needs a larger table would have to wait for.
         enter_keys(0, self.table, self.keys)
-        self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
+        self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`
         self.id_shift = 0  # of a later row: its id less its number
         self._id_room: I64 = np.empty(0, np.int64)  # where ids are listed that grow with every insert
         self._unlisted: tuple[I64, int] | None = None  # both as they were before factors had several rows
@@ -213,8 +214,14 @@ class FactorGraph(Arenas):
             self.name_factors(self.ids[:rows], int(self.ids[rows]))
 
     def name_factors(self, ids: I64, following: int) -> None:
-        """The factors that are there have these ids, ascending; the next one gets `following`."""
+        """The factors that are there have these ids; the next one gets `following`."""
         self.ids, self.id_shift = ids, following - ids.size
+
+    def rename_last(self, ids: I64, following: int) -> None:
+        """The factors in the last rows have these ids; the next one gets `following`."""
+        first = int(self.counts[at.FACTORS]) - ids.size
+        self.name_factors(np.concatenate([self.ids_of(np.arange(first)), ids]), following)
+        self._unlisted = None
 
     def ids_of(self, rows: I64) -> I64:
         """The ids of the factors in these rows of `fac`."""
@@ -229,7 +236,8 @@ class FactorGraph(Arenas):
         later = ids - self.id_shift
         found = np.where((later >= named) & (later < count), later, -1)
         if named:
-            place = np.minimum(np.searchsorted(self.ids, ids), named - 1)
+            order = np.argsort(self.ids, kind="stable")
+            place = order[np.minimum(np.searchsorted(self.ids, ids, sorter=order), named - 1)]
             found = np.where(self.ids[place] == ids, place, found)
         return found
 
@@ -306,12 +314,18 @@ class FactorGraph(Arenas):
         """All factors, or those of the first `most` rows: a copy, a group for each kind and loss."""
         fac = self.fac[: self.counts[at.FACTORS]][:most]
         groups, losses = list[FactorGroup](), losses_of(fac)
-        for kind, rows in self.kinds_of(np.flatnonzero(is_first(fac))):
+        firsts = np.flatnonzero(is_first(fac))
+        for kind, rows in self.kinds_of(firsts[np.argsort(self.ids_of(firsts), kind="stable")]):
             groups += [
                 self._group(kind, code, rows[losses[rows] == code])
                 for code in np.flatnonzero(np.bincount(losses[rows])).tolist()
             ]
         return groups
+
+    def factor_named(self, factor_id: int) -> FactorGroup:
+        """The factor with this id, which is there."""
+        rows = self.rows_of(np.array([factor_id]))
+        return self._group(self.kind_of(int(rows[0])), int(losses_of(self.fac[rows])[0]), rows)
 
     def _group(self, kind: FactorKind, code: int, rows: I64) -> FactorGroup:
         """Factors of one kind and loss."""

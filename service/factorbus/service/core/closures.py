@@ -1,0 +1,27 @@
+"""What a map's core makes of closures that are tested: an event where one's state changes, and verdicts that are no
+client's inserts."""
+
+from factorbus.proto import codec
+from factorbus.proto.closures import JUDGE
+from factorbus.service.core.events import Effect, Outcome, Publish, Verdict
+
+
+def asked_outcomes(verdict: Verdict) -> list[Outcome]:
+    """Those of inserts that clients sent."""
+    return [outcome for outcome in verdict.outcomes if outcome.insert.client != JUDGE]
+
+
+def closures_moved(verdict: Verdict, epoch: int) -> list[Effect]:
+    """The event `closures`, if the state of any is another."""
+    moved = verdict.closures
+    if not moved:
+        return []
+    told = {
+        "event": "closures",
+        "epoch": epoch,
+        "revision": verdict.revision,
+        "factors": [each.factor for each in moved],
+        "states": [each.state for each in moved],
+        "reasons": [each.reason for each in moved],
+    }
+    return [Publish("event", codec.encode_map(told))]

@@ -1,0 +1,295 @@
+"""What closures are, judged by the estimate: nothing is changed here.
+
+    look        new ones and a few suspects are judged together (`choosing`); those that are believed are to go in
+    look_back   of the closures that are in, the worst is judged against all others; an improbable one is to go out
+
+What cannot have changed is not computed anew: `Ledger.bound` says of one that is in, or that is improbable, what its d²
+is at most, or at least, while the map only gets factors.
+
+Where suspects agree that the map calls improbable, one place's closures are taken out of a copy of the solver, on
+trial: they are to stay out if more places' closures are believed then.
+
+All of it follows from the estimate and the ledger: the same ones give the same verdicts.
+"""
+
+from typing import TypeAlias
+
+import numpy as np
+
+from factorbus.solver.closures.choosing import (
+    AGREES,
+    IMPROBABLE,
+    LEAST_RIVALS,
+    PASSED,
+    Chosen,
+    choose_closures,
+    closure_places,
+    limits_of,
+)
+from factorbus.solver.closures.evidence import (
+    ClosureNumbers,
+    exact_weights_without,
+    numbers_without,
+    odds_without,
+    weights_without,
+)
+from factorbus.solver.closures.ledger import (
+    ACCEPTED,
+    SUSPECT,
+    Closure,
+    ClosureLedger,
+    ClosureVerdicts,
+    Ledger,
+    verdicts_of,
+)
+from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, tangent_of
+from factorbus.solver.closures.policy import ClosurePolicy
+from factorbus.solver.closures.switching import without_factors
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.errors import SolverError
+from factorbus.solver.kernels.closures.ahead import list_companions, weigh_residuals
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.solver import Solver
+
+CONTRADICTED = "contradicted"
+_NEWEST = 40  # suspects, or accepted ones, among which places are looked for
+_BELIEVED = {PASSED, AGREES}
+_PLANE_DIM, _SPACE_DIM = 3, 6
+_WORST = 4  # accepted ones whose d² is computed in a step
+_TOGETHER = 64  # new closures that are judged together: each two of them are compared
+_RETRY = 2  # rivals that have to be new before the same closures are tried again
+
+_Row: TypeAlias = tuple[Closure, str, str, float, float, int]
+
+
+class ClosureJudge:
+    """Judges the closures of a map."""
+
+    def __init__(self, policy: ClosurePolicy | None = None) -> None:
+        self.policy = policy or ClosurePolicy()
+        self.limits = {dims: limits_of(self.policy, dims) for dims in (_PLANE_DIM, _SPACE_DIM)}
+
+    def look(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
+        """Judge new ones of a kind, the oldest where there are many, and after a look that moved any, or with new ones,
+        suspects that may be believed now; None: there are none.  Raises SolverError.
+        """
+        ledger = ledgers.of_kind[kind]
+        new = ledger.unjudged()[:_TOGETHER]
+        if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: len(ledger.closures)].any():
+            return None
+        looked_at, settled = self._revisited(solver, ledgers, ledger, new)
+        alone = [_as_suspect(ledger.closures[row], IMPROBABLE) for row in settled.tolist()]
+        if not looked_at.size:
+            return verdicts_of(alone) if alone else None
+        chosen = self._chosen(solver, ledger, looked_at)
+        ledger.bound[looked_at] = np.linalg.inv(chosen.allowed)
+        rows = _rows(ledger, looked_at, chosen)
+        if chosen.rivals and not _believes(chosen):
+            tried = self._try_rivals(solver, ledger, looked_at[chosen.rivals])
+            again = {row[0].factor_id for row in tried}
+            rows = [row for row in rows if row[0].factor_id not in again] + tried
+        return verdicts_of(rows + alone)
+
+    def look_back(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
+        """The worst of those accepted, where it is improbable; None: none is.  Raises SolverError."""
+        ledger = ledgers.of_kind[kind]
+        tested, most = ledger.tested(), self.policy.closure_retests
+        if tested.size > most:
+            tested = tested[(ledgers.looks * most + np.arange(most)) % tested.size]
+        if not tested.size:
+            return None
+        out = self.limits[ledger.dim].out
+        most_likely = residuals_weighed(solver, ledger, tested)
+        worst = np.flatnonzero(~(most_likely <= out))
+        if not worst.size:
+            return None
+        order = np.argsort(-np.nan_to_num(most_likely[worst], nan=np.inf), kind="stable")
+        worst = tested[worst[order[:_WORST]]]
+        numbers = closure_numbers(solver, ledger, worst)
+        ledger.bound[worst] = weights_without(numbers)
+        d2 = residuals_weighed(solver, ledger, worst)
+        if float(d2.max()) <= out:
+            return None
+        row = worst[[int(d2.argmax())]]
+        ledger.bound[row] = exact_weights_without(closure_numbers(solver, ledger, row))
+        if (distance := residuals_weighed(solver, ledger, row).item()) <= out:
+            return None
+        found = ledger.closures[row.item()]
+        return verdicts_of([(found, SUSPECT, CONTRADICTED, distance, found.chance, found.tried)])
+
+    def _chosen(self, solver: Solver, ledger: Ledger, rows: I64) -> Chosen:
+        """Among rows."""
+        extent = self._extent(solver, ledger)
+        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds())
+
+    def _extent(self, solver: Solver, ledger: Ledger) -> float:
+        """Half the length of the map: mistakes may lead to wherever it has poses."""
+        graph = solver._graph
+        var = graph.var[: graph.counts[at.VARIABLES]]
+        starts = var[var[:, at.V_KIND] == (at.SE2 if ledger.dim == _PLANE_DIM else at.SE3), at.V_AT]
+        return float(np.ptp(graph.values[starts[:, None] + np.arange(2)], axis=0).max()) / 2.0
+
+    def _revisited(self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger, new: I64) -> tuple[I64, I64]:
+        """What to look at, and new ones that are improbable, as too few agree with them for the map to be wrong.
+
+        With new ones go, of the newest suspects that are unsure those of many places, and of those that are not, what
+        agrees with a new one; and what may be believed now that the map has moved, first what was not looked at for
+        longest.
+        """
+        most, out, settled, picked = self.policy.closure_revisits, self.limits[ledger.dim].out, new[:0], new
+        count = len(ledger.closures)
+        others = ledger.is_suspect[:count] & ~ledger.is_new[:count]
+        if new.size:
+            among = np.flatnonzero(others)[-4 * _NEWEST :]
+            is_improbable = ledger.is_improbable[among]
+            companions = self._companions(solver, ledger, new, np.ascontiguousarray(among[is_improbable][::-1]))
+            if companions.size + new.size < LEAST_RIVALS:
+                is_settled = np.array([ledger.closures[row].distance > out for row in new.tolist()])
+                settled, picked = new[is_settled], new[~is_settled]
+            if picked.size:
+                unsure = among[~is_improbable][-_NEWEST:][::-1]
+                picked = np.concatenate([picked, self._of_many_places(solver, ledger, unsure), companions[: most // 2]])
+        others[picked] = False
+        left = np.flatnonzero(others & (ledger.looked[: others.size] < ledgers.moved_at))
+        if left.size:
+            left = left[~(residuals_weighed(solver, ledger, left) > out)]
+            longest = left[np.argsort(ledger.looked[left], kind="stable")]
+            picked = np.concatenate([picked, longest[: max(most + new.size - picked.size, 0)]])
+        return np.sort(picked), settled
+
+    def _of_many_places(self, solver: Solver, ledger: Ledger, unsure: I64) -> I64:
+        """Half as many as may be looked at again, those first of whose place few have come before."""
+        most = self.policy.closure_revisits // 2
+        if unsure.size <= most:
+            return unsure
+        places = closure_places(closure_numbers(solver, ledger, unsure, False), self.policy.closure_place_m)
+        before = [int((places[:k] == places[k]).sum()) for k in range(unsure.size)]
+        return unsure[np.argsort(before, kind="stable")][:most]
+
+    def _companions(self, solver: Solver, ledger: Ledger, new: I64, others: I64) -> I64:
+        """Of `others`, in their order, those whose loop with a new one comes back within the policy's spread."""
+        if not others.size or ledger.dim != _PLANE_DIM:
+            return others
+        found, spread = np.empty(others.size, np.int64), self.limits[ledger.dim].spread
+        table = solver._graph.array_table
+        count = list_companions(new, others, ledger.ends, ledger.z, table, spread.metres, spread.radians, found)
+        return found[:count]
+
+    def _try_rivals(self, solver: Solver, ledger: Ledger, rivals: I64) -> list[_Row]:
+        """Without closures that are in: where the rivals are believed then, and are more likely right than these, they
+        go in instead.
+
+        Rivals of several places are held against the closures of one place, the least sure; those of one place against
+        the least sure closure, if that is not sure by all others that are in.
+        """
+        newest = int(np.sort([ledger.closures[row].factor_id for row in rivals.tolist()])[-_RETRY])
+        numbers, within = closure_numbers(solver, ledger, rivals, False), self.policy.closure_place_m
+        several = np.unique(closure_places(numbers, within)).size > 1
+        untried = np.array([row for row in ledger.tested().tolist() if ledger.closures[row].tried < newest], np.int64)
+        find = self._least_sure_place if several else self._least_sure
+        on_trial, odds, stay = find(solver, ledger, untried)
+        if not on_trial:
+            return stay
+        last = max(ledger.closures[row].factor_id for row in rivals.tolist())
+        stay += [(c, c.state, c.reason, c.distance, c.chance if several else odds, last) for c in on_trial]
+        rows = np.concatenate([[c.row for c in on_trial], rivals])
+        numbers = numbers_without(closure_numbers(solver, ledger, rows), len(on_trial))
+        if not _believes(choose_closures(numbers, self._extent(solver, ledger), self.policy, ledger.odds())):
+            return stay  # by the linear model, which takes no step
+        try:
+            without = without_factors(solver, [c.factor_id for c in on_trial])
+        except SolverError:
+            return stay  # the map does not stand without them
+        chosen = self._chosen(without, ledger, rivals)
+        believed = np.array([reason in _BELIEVED for reason in chosen.reasons])
+        numbers = closure_numbers(without, ledger, rivals[believed], False)
+        places = np.unique(closure_places(numbers, within)).size if believed.any() else 0
+        is_more_likely = places > 0 and chosen.chance[believed].min() <= self.policy.closure_chance_max * odds
+        if not (places > 1 if several else is_more_likely):
+            return stay
+        out = [(c, SUSPECT, CONTRADICTED, c.distance, c.chance, last) for c in on_trial]
+        gone = {c.factor_id for c in on_trial}
+        return [row for row in stay if row[0].factor_id not in gone] + out + _rows(ledger, rivals, chosen)
+
+    def _least_sure_place(
+        self, solver: Solver, ledger: Ledger, untried: I64
+    ) -> tuple[list[Closure], float, list[_Row]]:
+        """Of the newest that are in, the closures of the place of the one that was least sure when it came."""
+        tested = untried[-_NEWEST:]
+        if not tested.size:
+            return [], 1.0, []
+        least_sure = int(np.argmax([ledger.closures[row].chance for row in tested.tolist()]))
+        now, within = closure_numbers(solver, ledger, tested, False), self.policy.closure_place_m
+        near = [np.linalg.norm(T[:, :-1, -1] - T[least_sure, :-1, -1], axis=1) <= within for T in (now.a, now.b)]
+        return [ledger.closures[row] for row in tested[near[0] & near[1]].tolist()], 1.0, []
+
+    def _least_sure(self, solver: Solver, ledger: Ledger, untried: I64) -> tuple[list[Closure], float, list[_Row]]:
+        """The one that is least sure by all the others, and its odds; and the rest that may have been, with theirs."""
+        if ledger.dim != _PLANE_DIM:
+            return [], 1.0, []
+        least = self.policy.closure_sets_max
+        chance = np.array([ledger.closures[row].chance for row in untried.tolist()])
+        unsure = untried[np.argsort(-chance, kind="stable")][: min(_WORST, np.count_nonzero(chance > least))]
+        if not unsure.size:
+            return [], 1.0, []
+        odds = odds_without(closure_numbers(solver, ledger, unsure), self.limits[ledger.dim].spread)
+        closures = [ledger.closures[row] for row in unsure.tolist()]
+        worst = int(odds.argmax())
+        on_trial = [closures[worst]] if odds[worst] > least else []
+        rows = zip(closures, odds.tolist(), strict=True)
+        return (
+            on_trial,
+            float(odds[worst]),
+            [(c, c.state, c.reason, c.distance, p, c.tried) for c, p in rows if c not in on_trial],
+        )
+
+
+def _believes(chosen: Chosen) -> bool:
+    """Whether any is believed."""
+    return any(reason in _BELIEVED for reason in chosen.reasons)
+
+
+def _as_suspect(c: Closure, reason: str) -> _Row:
+    return c, SUSPECT, reason, c.distance, c.chance, c.tried
+
+
+def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:
+    """rᵀ W r (n,) of some closures, W their bounds."""
+    if ledger.dim == _PLANE_DIM:
+        out = np.empty(rows.size)
+        weigh_residuals(rows, ledger.ends, ledger.z, ledger.bound, solver._graph.array_table, out)
+        return out
+    now = closure_numbers(solver, ledger, rows, False)
+    r = tangent_of(inverse_motion(now.z) @ inverse_motion(now.a) @ now.b)
+    return np.einsum("na,nab,nb->n", r, ledger.bound[rows], r)
+
+
+def closure_numbers(solver: Solver, ledger: Ledger, rows: I64, with_covariance: bool = True) -> ClosureNumbers:
+    """Of some closures, with the poses they are between as the solver has them."""
+    ends, graph = ledger.ends[rows], solver._graph
+    listed = ends.reshape(-1).tolist()
+    place = {v: k for k, v in enumerate(dict.fromkeys(listed))}
+    different, where = np.array(list(place), np.int64), np.array([place[v] for v in listed], np.int64)
+    T = motions_of_poses(graph.values[graph.var[different, at.V_AT, None] + np.arange(ledger.size)])[where]
+    known = np.empty((0, 0))
+    if with_covariance:
+        source, d = solver.covariances, ledger.dim
+        is_free = bool((graph.var[different, at.V_SCALAR] >= 0).all())
+        known = source.try_joint(different) if is_free else None
+        if known is None:
+            known = CovarianceBlocks(source.try_view() or source.factored()).joint(different)
+        if different.size < where.size:
+            scalars = (where[:, None] * d + np.arange(d)).reshape(-1)
+            known = known[scalars[:, None], scalars]
+    a, b = np.ascontiguousarray(T[0::2]), np.ascontiguousarray(T[1::2])
+    return ClosureNumbers(a, b, ledger.z[rows], ledger.noise[rows], known)
+
+
+def _rows(ledger: Ledger, rows: I64, chosen: Chosen) -> list[_Row]:
+    return [
+        (c, ACCEPTED if reason in _BELIEVED else SUSPECT, reason, float(d2), float(p), c.tried)
+        for c, reason, d2, p in zip(
+            (ledger.closures[row] for row in rows.tolist()), chosen.reasons, chosen.distance, chosen.chance, strict=True
+        )
+    ]

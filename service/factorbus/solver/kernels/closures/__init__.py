@@ -1,0 +1,1 @@
+"""Loop closures in the plane that are tested when they come."""
