@@ -69,6 +69,7 @@ RANGES = types.MappingProxyType(
         "relinearize_cooldown_factor": _FINITE,
         "relinearize_cooldown_flops": _FACTOR,
         "max_rounds": _count(1),
+        "step_budget": _FACTOR,
         "converged_share": _FINITE,
         "wildfire_threshold": _SHARE,
         "constrain_recent_steps": _count(0),

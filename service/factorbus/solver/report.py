@@ -30,6 +30,10 @@ class StepReport(NamedTuple):
                  tolerance
     phases_ms    milliseconds by phase;  step_ms: the whole step;  compiled_ms: the part of it within one compiled call,
                  where that does the work (mode "bayes-tree"), else None
+    deferred_relinearizations   variables that are due to be relinearized in a later step (mode "bayes-tree")
+    unsolved     what χ² may be above the optimum of this map: what `converged` goes by, and what a step with a budget
+                 left where it was (mode "bayes-tree")
+    work         what the step took, in the units of `Options.step_budget` (mode "bayes-tree")
     """
 
     mode: str
@@ -51,6 +55,9 @@ class StepReport(NamedTuple):
     phases_ms: Mapping[str, float] = _NONE
     step_ms: float = 0.0
     compiled_ms: float | None = None
+    deferred_relinearizations: int = 0
+    unsolved: float = 0.0
+    work: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""

@@ -1,5 +1,6 @@
 """What the modes of solving differ in: how a step brings the estimate up to date with what is new in the graph."""
 
+import math
 from typing import Protocol
 
 from factorbus.solver.graph.factor_graph import Mark
@@ -10,9 +11,9 @@ from factorbus.solver.report import StepReport
 class Stepper(Protocol):
     """Solves for what is new in a graph, step by step: `bayes_tree.steps` and `inc_l.steps`."""
 
-    def step(self, settle: bool) -> StepReport:
-        """Solve for what is new; with `settle` until it has converged.  Raises Underconstrained, NotFinite; what is new
-        is taken back then, and all is as it was, bit for bit."""
+    def step(self, settle: bool, budget: float = math.inf) -> StepReport:
+        """Solve for what is new; with `settle` until it has converged, else within `budget` in the mode "bayes-tree".
+        Raises Underconstrained, NotFinite; what is new is taken back then, and all is as it was, bit for bit."""
         ...
 
     def resume(self, settle: bool) -> StepReport:

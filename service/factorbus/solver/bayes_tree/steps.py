@@ -72,11 +72,12 @@ class TreeSteps:
         """How much of the graph there was after the last step."""
         return self._mark
 
-    def step(self, settle: bool) -> StepReport:
+    def step(self, settle: bool, budget: float = math.inf) -> StepReport:
         """As `Solver.step`."""
         clock = self._options.clock
         started = clock() if clock else 0.0
         tree, because = self._tree, ""
+        tree.set_budget(math.inf if settle else budget)
         try:
             status = tree.step()
             if status == tl.UNSURE:
@@ -89,9 +90,11 @@ class TreeSteps:
         except BaseException:
             self._graph.forget(self._mark)
             raise
+        finally:
+            bounded = tree.set_budget(math.inf)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
-        if not settle and not tree.state.item(tl.S_AFTER) and not self._stalls:
+        if not settle and (self._may_be_worse(bounded) or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
             self._damping = 0.0
             return self._report(started, compiled, None, because)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
@@ -141,6 +144,8 @@ class TreeSteps:
         _, chi2, _, error, _, _, _, left, *_ = self._tree.totals.tolist()
         share = max(chi2, 0.0) + LEAST_CHI2
         scalars = int(self._graph.counts[at.SCALARS])
+        if self._tree.behind:
+            return True
         if self._at_linearization or self._tree.raised:
             return not self._is_within(_AT_END, chi2)
         return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
@@ -152,6 +157,13 @@ class TreeSteps:
             return False
         least = FINISHED * self._share
         return self._gained < -least or (self._gained <= least and self.unfinished)
+
+    def _may_be_worse(self, bounded: bool) -> bool:
+        """Whether χ² may be more than before the step: one with a budget has none for Levenberg-Marquardt on all of Λ,
+        and a step with nothing new sees to it.
+        """
+        state = self._tree.state
+        return bounded and not state.item(tl.S_CONTINUES) and math.isfinite(self._tree.totals.item(tl.T_CHI2))
 
     @property
     def _gained(self) -> float:
@@ -280,10 +292,11 @@ class TreeSteps:
         reported = self._tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        _, chi2, _, error, allowed, chi2_before = self._tree.totals[: tl.T_BEFORE + 1].tolist()
+        model, chi2, _, error, allowed, chi2_before, *_, least, _, _, work = self._tree.totals.tolist()
         chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
+        behind = self._tree.behind
         share = self._options.converged_share
-        converged = result.converged if result else error <= allowed
+        converged = result.converged if result else error <= allowed and not behind
         if not result and self._tree.raised:
             converged &= self._is_within(share, chi2)
         converged = converged or (not result and not self.unfinished)
@@ -309,6 +322,9 @@ class TreeSteps:
             PhaseShares(tl.PHASES, reported[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
+            self._tree.deferred,
+            0.0 if result and result.converged else min(error + (chi2 - model if behind else 0.0), chi2 - least),
+            work,
         ))  # fmt: skip
 
 

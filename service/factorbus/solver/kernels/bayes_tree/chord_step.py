@@ -31,6 +31,7 @@ from factorbus.solver.kernels.bayes_tree.missed_residual import (
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
+from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
 from factorbus.solver.kernels.jit.simd import at as load
@@ -63,6 +64,7 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     node, clique, state = tree.node, tree.clique, tree.state
     now = cycles()
     # 1
+    note_work(SCANNING * state[tl.S_FACTORS], tree.totals)
     state[tl.S_STAMP] += 1
     scratch, end = make_scratch(), tree.marked.size
     for f in range(state[tl.S_FACTORS]):
@@ -78,7 +80,7 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     now = lap(now, tl.ELIMINATE, state)
     # 3
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
-    substitute(graph, tree, roots, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked)
+    substitute(graph, tree, roots, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked, settings[tl.P_BUDGET])
     # 4
     state[tl.S_DUE], state[tl.S_WAITING], state[tl.S_CHORDS] = 0, state[tl.S_STEP], state[tl.S_CHORDS] + 1
     weighted_error = measure(graph, tree, settings)

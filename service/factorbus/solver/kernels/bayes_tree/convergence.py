@@ -5,6 +5,7 @@ from factorbus.solver.kernels.bayes_tree.chord_step import error_left
 from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_errors
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
+from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel
 from factorbus.solver.kernels.model.records import Graph
 
@@ -40,6 +41,7 @@ def mark_unconverged(graph: Graph, tree: Tree, settings: F64) -> None:
     """Where Σ error² is more than is allowed, all variables that have a part in it are relinearized next."""
     state, totals = tree.state, tree.totals
     if totals[tl.T_ERROR] > allowed(settings, state, totals):
+        note_work(SCANNING * state[tl.S_FACTORS], totals)
         mark_large_errors(least_error(settings, state, totals), graph, tree)
         state[tl.S_DUE] = 1
 
