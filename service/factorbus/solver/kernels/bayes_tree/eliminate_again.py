@@ -137,7 +137,7 @@ def order_fronts(
 
 @inline_kernel
 def note_relinearized(moving: I64, flops: int, node: I64, pending: I64, state: I64) -> None:
-    """The variables `moving` do not wait any more, and any others are due still; flops: what their elimination took."""
+    """The variables `moving` do not wait any more, and the others from now on; flops: what their elimination took."""
     for k in range(moving.size):
         node[moving[k], tl.N_FLAGS], node[moving[k], tl.N_LINEARIZED] = FREE, state[tl.S_STEP]
     left = 0
@@ -146,7 +146,7 @@ def note_relinearized(moving: I64, flops: int, node: I64, pending: I64, state: I
             if node[pending[k], tl.N_FLAGS] != FREE:
                 pending[left] = pending[k]
                 left += 1
-    state[tl.S_PENDING], state[tl.S_DUE] = left, 1 if left > 0 else 0
+    state[tl.S_PENDING], state[tl.S_DUE], state[tl.S_WAITING] = left, 0, state[tl.S_STEP]
     state[tl.S_RELINEARIZED_AT] = state[tl.S_STEP]
     state[tl.S_RELINEARIZING] = flops
 

@@ -88,15 +88,13 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     if not add_factors(graph, tree, f1):
         undo(graph, tree, v0)
         return tl.INFINITE
-    none_fits = False
+    put_off = False  # of what is due a part is left for later steps
     while True:
         moving = tree.pending[: count_due(state)]
         if moving.size > 0 and bounded:
-            moving = (
-                list_moving(moving, tree.node) if goes_on_with_it else choose_due(graph, tree, f1, scaled[tl.P_BUDGET])
-            )
-            none_fits = moving.size == 0
-            if none_fits and state[tl.S_ROUNDS] > 0:
+            moving = list_moving(moving, tree.node) if goes_on_with_it else choose_due(graph, tree, f1, scaled)
+            put_off = moving.size < state[tl.S_PENDING]
+            if moving.size == 0 and state[tl.S_ROUNDS] > 0:
                 break
         goes_on_with_it = False
         if moving.size > 0:
@@ -129,9 +127,9 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
             break
         if state[tl.S_WAIT] != 0 or not goes_on(weighted_error, scaled, state, totals):
             break
-        if not may_go_on(tree, scaled[tl.P_BUDGET]) or none_fits:
+        if put_off or not may_go_on(tree, scaled[tl.P_BUDGET]):
             break
-        if may_keep_factor(tree, scaled) and (not bounded or fits_chord_step(tree, scaled[tl.P_BUDGET])):
+        if may_keep_factor(tree, scaled) and fits_chord_step(tree, scaled[tl.P_BUDGET]):
             weighted_error = chord_step(least_error(scaled, state, totals), graph, tree, scaled)
             began = cycles()
             totals[tl.T_GAINED] = max(totals[tl.T_GAINED], chi2 - totals[tl.T_CHI2])
@@ -141,7 +139,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     changed = tree.changed[: state[tl.S_CHANGED]]
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
-    if none_fits and may_try(state):
+    if put_off and state[tl.S_RELINEARIZED] == 0 and may_try(state):
         state[tl.S_TRY_AT] = state[tl.S_STEP] + RETRY
     note_after(settings, state, totals)
     return tl.DONE
