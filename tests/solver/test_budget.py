@@ -173,7 +173,7 @@ def test_every_insert_is_accepted_with_a_budget_below_anything() -> None:
             each.stage(batch)
         report, theirs = solver.step(), free.step()
         assert (report.new_variables, report.new_factors) == (theirs.new_variables, theirs.new_factors)
-        assert report.relinearized == 0
+        assert report.relinearized <= report.eliminated  # what is eliminated anyway
         assert report.iterations <= 1
         heavy += theirs.iterations > 1
     assert heavy > 5

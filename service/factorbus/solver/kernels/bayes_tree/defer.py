@@ -3,7 +3,7 @@
 A variable takes the cliques that eliminate the variables of its factors, and all above them.  So whole subtrees are
 chosen, from the root down: those first in which most error is corrected for the work.
 
-    1  consider   the variables that wait, but for those whose error is negligible
+    1  consider   the variables that wait; where they do not fit, without those whose error is negligible
     2  want       the cliques that their relinearization takes, children first
     3  sum        work and error of each of these subtrees
     4  take       subtrees, as many as fit
@@ -30,6 +30,7 @@ from factorbus.solver.kernels.model.records import Graph
 KEPT, LEAST = 0.25, 0.125
 LOOKING = 20_000.0  # of each variable that is considered
 FEWEST = 256  # that are considered
+CHORD = 3.0  # times what back-substitution takes: there is the forward solve as well
 TRIES = 200  # cliques that are looked at from the root down, at most
 ENOUGH = 0.75  # of the budget: where less of it is used there may be another round
 RETRY = 16  # steps without a try after one in which there was nothing to choose
@@ -40,17 +41,50 @@ UNWANTED, WANTED, TAKEN, WHOLE = 0, 1, 2, 3
 @part
 def choose_due(graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
     """The variables that wait and are relinearized now, in the order in which they wait; the factors up to f1 come
-    first.
+    first.  All of them, if they fit.
     """
-    clique, state, totals = tree.clique, tree.state, tree.totals
+    state = tree.state
     if not may_try(state):
         return tree.pending[:0].copy()
-    # 1
-    budget, fate, listed = settings[tl.P_BUDGET], np.zeros(len(clique), np.int64), np.empty(len(clique), np.int64)
-    considered = list_considered(graph, tree, settings)
+    moving = choose_among(list_considered(graph, tree, -1.0, settings), graph, tree, f1, settings)
+    if moving.size == state[tl.S_PENDING]:
+        return moving
+    # A step that gained much has all relinearized that has a part in a much smaller sum than what keeps the map from
+    # having converged: what does not fit of that is not worth the steps that follow.
+    least = PASSED_OVER * settings[tl.P_CONVERGED] * (tree.totals[tl.T_CHI2] + LEAST_CHI2) / state[tl.S_FACTORS]
+    return choose_among(list_considered(graph, tree, least, settings), graph, tree, f1, settings)
+
+
+@part
+def list_considered(graph: Graph, tree: Tree, least: float, settings: F64) -> I64:
+    """The variables that wait and have a factor with an error² of more than `least`, of as many as may be looked at."""
+    node, pending, state = tree.node, tree.pending, tree.state
+    count = state[tl.S_PENDING]
+    most = min(count, max(FEWEST, int(KEPT * settings[tl.P_BUDGET] / LOOKING)))
+    # Where there are more, those of another part of the list in each step.
+    first, n, found = (state[tl.S_STEP] * most) % count if most < count else 0, 0, np.empty(most, np.int64)
+    for k in range(first, first + most):
+        v = pending[k % count]
+        slot, matters = node[v, tl.N_ADJ], least < 0.0
+        while slot >= 0 and not matters:
+            f = head_of(slot // 2, graph.fac)
+            matters = tree.factor_errors[f, tl.E_ERROR] > least or moves_far(f, least, graph, tree)
+            slot = next_incidence(slot, tree.link)
+        if matters:
+            found[n] = v
+            n += 1
+    note_work(LOOKING * most, tree.totals)
+    return found[:n].copy()
+
+
+@part
+def choose_among(considered: I64, graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
+    """Those of the variables that fit into what the budget leaves for them."""
+    clique, state, budget = tree.clique, tree.state, settings[tl.P_BUDGET]
+    fate, listed = np.zeros(len(clique), np.int64), np.empty(len(clique), np.int64)
     # 2
     end = want_changed(graph, tree, f1, fate, listed)
-    used = totals[tl.T_WORK]
+    used = tree.totals[tl.T_WORK]
     for k in range(end, listed.size):
         fate[listed[k]] = TAKEN
         used += work_of_clique(clique[listed[k]])
@@ -68,35 +102,6 @@ def choose_due(graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
     kept = min(KEPT * budget, SOLVING * state[tl.S_VARIABLES])
     take_subtrees(max(budget - kept - used, LEAST * budget), work, gain, fate, clique, wanted)
     return list_covered(graph, tree, considered, fate)
-
-
-@part
-def list_considered(graph: Graph, tree: Tree, settings: F64) -> I64:
-    """The variables that wait, as many as may be looked at, without those that have no part in what keeps the map from
-    having converged.
-
-    A step that gained much has all relinearized that has a part in a much smaller sum: what its budget left of these is
-    not worth the steps that follow.
-    """
-    node, pending, state, totals = tree.node, tree.pending, tree.state, tree.totals
-    count = state[tl.S_PENDING]
-    most = min(count, max(FEWEST, int(KEPT * settings[tl.P_BUDGET] / LOOKING)))
-    # Where there are more, those of another part of the list in each step.
-    first, n, found = (state[tl.S_STEP] * most) % count, 0, np.empty(most, np.int64)
-    share = PASSED_OVER * settings[tl.P_CONVERGED] / state[tl.S_FACTORS]
-    least = share * (totals[tl.T_CHI2] + LEAST_CHI2)
-    for k in range(first, first + most):
-        v = pending[k % count]
-        slot, matters = node[v, tl.N_ADJ], False
-        while slot >= 0 and not matters:
-            f = head_of(slot // 2, graph.fac)
-            matters = tree.factor_errors[f, tl.E_ERROR] > least or moves_far(f, least, graph, tree)
-            slot = next_incidence(slot, tree.link)
-        if matters:
-            found[n] = v
-            n += 1
-    note_work(LOOKING * most, totals)
-    return found[:n]
 
 
 @part
@@ -217,7 +222,7 @@ def fits_chord_step(tree: Tree, budget: float) -> bool:
     if budget == math.inf:
         return True
     state = tree.state
-    work = SCANNING * state[tl.S_FACTORS] + SOLVING * state[tl.S_CHANGED]
+    work = SCANNING * state[tl.S_FACTORS] + CHORD * SOLVING * state[tl.S_CHANGED]
     return tree.totals[tl.T_WORK] + work <= budget
 
 
