@@ -96,7 +96,7 @@ def test_the_far_part_stays_behind_and_follows() -> None:
     solver = Solver()
     for n, batch in enumerate(batches):
         solver.stage(batch)
-        report = solver.step(budget=1e5 if n % 50 else np.inf)
+        report = solver.step(budget=1e5 if n % 50 else 0.0)
         tree = tree_of(solver)
         if not tree.behind:
             continue
@@ -150,7 +150,7 @@ def test_the_same_budgets_make_the_same_bits_also_from_a_state_in_between(world:
     assert bits(kept) == bits(gone_on)
 
 
-def test_a_budget_that_is_not_reached_changes_what_rounding_does() -> None:
+def test_a_budget_that_is_not_reached_changes_no_more_than_rounding() -> None:
     free, wide = Solver(), Solver(Options(step_budget=1e13))
     for batch in WORLDS["streets"](5):
         for solver in (free, wide):
@@ -262,7 +262,7 @@ def unheld(loose: Batch, n: int) -> Batch:
     return Batch((group._replace(keys=np.array([-1000 - n]), values=group.values[:1], fixed=False),), ())
 
 
-@pytest.mark.parametrize("budget", [0.0, -1.0, float("nan"), True, "10"])
-def test_a_budget_is_a_number_above_zero(budget: object) -> None:
+@pytest.mark.parametrize("budget", [-1.0, float("nan"), float("inf"), True, "10"])
+def test_a_budget_is_a_finite_number(budget: object) -> None:
     with pytest.raises(errors.BadOption, match="step_budget"):
         Options(step_budget=budget)  # type: ignore[arg-type]

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+_OF_A_BUDGET = ("deferred_relinearizations", "unsolved", "work", "budget")
 _NONE: Mapping[str, float] = MappingProxyType({})
 
 
@@ -33,7 +34,7 @@ class StepReport(NamedTuple):
     deferred_relinearizations   variables that are due to be relinearized in a later step (mode "bayes-tree")
     unsolved     what χ² may be above the optimum of this map: what `converged` goes by, and what a step with a budget
                  left where it was (mode "bayes-tree")
-    work         what the step took, in the units of `Options.step_budget` (mode "bayes-tree")
+    work, budget what the step took and what it might take, in the units of `Options.step_budget`; 0: it had no bound
     """
 
     mode: str
@@ -58,6 +59,7 @@ class StepReport(NamedTuple):
     deferred_relinearizations: int = 0
     unsolved: float = 0.0
     work: float = 0.0
+    budget: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
@@ -66,6 +68,9 @@ class StepReport(NamedTuple):
         shown["phases_ms"] = phases.as_dict() if isinstance(phases, PhaseShares) else dict(phases)
         if self.compiled_ms is None:
             del shown["compiled_ms"]
+        if not self.budget:
+            for name in _OF_A_BUDGET:
+                del shown[name]
         return shown
 
 

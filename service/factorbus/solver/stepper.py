@@ -1,6 +1,5 @@
 """What the modes of solving differ in: how a step brings the estimate up to date with what is new in the graph."""
 
-import math
 from typing import Protocol
 
 from factorbus.solver.graph.factor_graph import Mark
@@ -11,8 +10,8 @@ from factorbus.solver.report import StepReport
 class Stepper(Protocol):
     """Solves for what is new in a graph, step by step: `bayes_tree.steps` and `inc_l.steps`."""
 
-    def step(self, settle: bool, budget: float = math.inf) -> StepReport:
-        """Solve for what is new; with `settle` until it has converged, else within `budget` in the mode "bayes-tree".
+    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
+        """Solve for what is new; with `settle` until it has converged, else within `budget`, as `Options.step_budget`.
         Raises Underconstrained, NotFinite; what is new is taken back then, and all is as it was, bit for bit."""
         ...
 

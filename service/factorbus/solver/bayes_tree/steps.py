@@ -72,12 +72,12 @@ class TreeSteps:
         """How much of the graph there was after the last step."""
         return self._mark
 
-    def step(self, settle: bool, budget: float = math.inf) -> StepReport:
+    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
         """As `Solver.step`."""
         clock = self._options.clock
         started = clock() if clock else 0.0
         tree, because = self._tree, ""
-        tree.set_budget(math.inf if settle else budget)
+        tree.set_budget(0.0 if settle else budget)
         try:
             status = tree.step()
             if status == tl.UNSURE:
@@ -91,12 +91,13 @@ class TreeSteps:
             self._graph.forget(self._mark)
             raise
         finally:
-            bounded = tree.set_budget(math.inf)
+            bounded = tree.set_budget(0.0) and self._may_be_worse
         compiled = clock() if clock else 0.0
         self._at_linearization = False
-        if not settle and (self._may_be_worse(bounded) or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
+        if not settle and (bounded or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
             self._damping = 0.0
-            return self._report(started, compiled, None, because)
+            report = self._report(started, compiled, None, because)
+            return report._replace(budget=budget) if bounded else report
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
         return self._report(started, compiled, result, because)
 
@@ -158,12 +159,13 @@ class TreeSteps:
         least = FINISHED * self._share
         return self._gained < -least or (self._gained <= least and self.unfinished)
 
-    def _may_be_worse(self, bounded: bool) -> bool:
-        """Whether χ² may be more than before the step: one with a budget has none for Levenberg-Marquardt on all of Λ,
-        and a step with nothing new sees to it.
+    @property
+    def _may_be_worse(self) -> bool:
+        """Whether the tree's last step, which had a budget, stands with a χ² above that of before.
+
+        There is none for Levenberg-Marquardt on all of Λ; a step with nothing new, which has no bound, sees to it.
         """
-        state = self._tree.state
-        return bounded and not state.item(tl.S_CONTINUES) and math.isfinite(self._tree.totals.item(tl.T_CHI2))
+        return not self._tree.state.item(tl.S_CONTINUES) and math.isfinite(self._tree.totals.item(tl.T_CHI2))
 
     @property
     def _gained(self) -> float:

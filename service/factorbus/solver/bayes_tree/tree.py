@@ -23,10 +23,10 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.task_queue import NOBODY
+from factorbus.solver.option_ranges import MOST_BUDGET
 from factorbus.solver.options import Options
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 
-_MOST_BUDGET = 1e15  # more is no budget: a step of weeks
 _FEW = 8  # new variables for which good first values are looked for
 
 
@@ -52,10 +52,10 @@ class CliqueTree(Arenas):
 
     def set_budget(self, budget: float) -> bool:
         """What the steps that follow may take, in units of work (`kernels/bayes_tree/work.py`), before they defer the
-        rest; gives whether those before had a bound.
+        rest; 0: without bound.  Gives whether those before had one.
         """
         was = self.settings.item(tl.P_BUDGET)
-        self.settings[tl.P_BUDGET] = budget if budget < _MOST_BUDGET else math.inf
+        self.settings[tl.P_BUDGET] = budget if 0.0 < budget <= MOST_BUDGET else math.inf
         return was < math.inf
 
     def clear(self) -> None:

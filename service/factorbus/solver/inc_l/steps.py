@@ -7,7 +7,6 @@
 5  report     what was done, and where this leaves things
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,7 +79,7 @@ class IncrementalSteps:
         """For tests."""
         return self._system
 
-    def step(self, settle: bool, budget: float = math.inf) -> StepReport:
+    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
         """As `Solver.step`."""
         return self._step(settle, self._options.initialize_locally)
 
