@@ -96,8 +96,7 @@ class TreeSteps:
         self._at_linearization = False
         if not settle and (bounded or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
             self._damping = 0.0
-            report = self._report(started, compiled, None, because)
-            return report._replace(budget=budget) if bounded else report
+            return self._report(started, compiled, None, because, budget if bounded else 0.0)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
         return self._report(started, compiled, result, because)
 
@@ -287,7 +286,9 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _report(self, started: float, compiled: float, result: Minimization | None, because: str) -> StepReport:
+    def _report(
+        self, started: float, compiled: float, result: Minimization | None, because: str, budget: float = 0.0
+    ) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], result is not None
@@ -327,6 +328,7 @@ class TreeSteps:
             self._tree.deferred,
             0.0 if result and result.converged else min(error + (chi2 - model if behind else 0.0), chi2 - least),
             work,
+            budget,
         ))  # fmt: skip
 
 
