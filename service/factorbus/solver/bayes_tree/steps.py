@@ -91,14 +91,14 @@ class TreeSteps:
             self._graph.forget(self._mark)
             raise
         finally:
-            bounded = tree.set_budget(0.0) and self._may_be_worse
+            bounded = tree.set_budget(0.0) and not tree.state.item(tl.S_CONTINUES)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
-        if not settle and (bounded or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
+        if not settle and (self._is_torn or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
             self._damping = 0.0
             return self._report(started, compiled, None, because, budget if bounded else 0.0)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
-        return self._report(started, compiled, result, because)
+        return self._report(started, compiled, result, because, budget if bounded else 0.0)
 
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
@@ -159,12 +159,9 @@ class TreeSteps:
         return self._gained < -least or (self._gained <= least and self.unfinished)
 
     @property
-    def _may_be_worse(self) -> bool:
-        """Whether the tree's last step, which had a budget, stands with a χ² above that of before.
-
-        There is none for Levenberg-Marquardt on all of Λ; a step with nothing new, which has no bound, sees to it.
-        """
-        return not self._tree.state.item(tl.S_CONTINUES) and math.isfinite(self._tree.totals.item(tl.T_CHI2))
+    def _is_torn(self) -> bool:
+        """Whether the tree's last step left a part of the map behind, so that its χ² says nothing yet."""
+        return self._tree.behind and math.isfinite(self._tree.totals.item(tl.T_CHI2))
 
     @property
     def _gained(self) -> float:
@@ -211,7 +208,8 @@ class TreeSteps:
         if settle or worse or rises or goes_on or self._stalls:
             tree.exchange()
             before = self._graph.values.copy()
-            if not worse and not (continues and self._gained < 0.0):
+            # After a torn estimate a whole one may have the lower χ², and be worse than when nothing was behind.
+            if not (worse and not chi2 <= chi2_before) and not (continues and self._gained < 0.0):
                 tree.exchange()
             result = self._batch(before, settle, continues)
             reasons = (settle, _ASKED), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON), (True, _STALLS)
@@ -295,7 +293,7 @@ class TreeSteps:
         reported = self._tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        model, chi2, _, error, allowed, chi2_before, *_, least, _, _, work = self._tree.totals.tolist()
+        model, chi2, _, error, allowed, chi2_before, *_, least, _, _, work, _ = self._tree.totals.tolist()
         chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
         behind = self._tree.behind
         share = self._options.converged_share

@@ -23,6 +23,7 @@ QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn with a smaller error is not c
 LEAST_SHARE = 0.125  # of the budget, which back-substitution has whatever came before it
 SURROUNDINGS = 16  # levels of the tree below the root, which come before what is further down
 ALL_LEVELS = 1 << 62
+MOST_TORN = 50  # steps in a row that leave something behind: then one does not, whatever it takes, so that χ² is known
 NARROW = 16.0  # numbers of R a scalar; where there are more, separators may be further off
 
 
@@ -36,7 +37,7 @@ def substitute(
     were.  moved: gets them all since their factors were evaluated last.  listed: scratch, for all cliques.  T_LEFT gets
     the largest square by which a separator that was left alone is off.  wildfire_threshold 0: no separator is left
     alone, nor one that was so below a clique that does not move now.  budget: of the step, see `work`; where it is used
-    what was there before stays behind, what is furthest from the root first, and S_BEHIND becomes 1
+    what was there before stays behind, what is furthest from the root first
     """
     var = graph.var
     clique, lists, numbers, lin = tree.clique, tree.lists, tree.numbers, tree.lin
@@ -48,7 +49,7 @@ def substitute(
     motion[rg.LEFT] = 0.0
     shares = np.empty(64)
     body = count = 0
-    work, bounded = 0.0, budget < np.inf
+    work, bounded = 0.0, budget < np.inf and state[tl.S_BEHIND] < MOST_TORN
     limit = max(budget - totals[tl.T_WORK], LEAST_SHARE * budget)
     level = np.empty(len(clique) if bounded else 0, np.int64)
     for turn in range(2 if bounded else 1):
@@ -119,7 +120,7 @@ def note_behind(ids: I64, clique: I64, state: I64) -> None:
             roots += 1
             behind |= clique[ids[f], tl.C_MOVES] & tl.BEHIND != 0
     if behind or roots == state[tl.S_ROOTS]:
-        state[tl.S_BEHIND] = 1 if behind else 0
+        state[tl.S_BEHIND] = state[tl.S_BEHIND] + 1 if behind else 0
 
 
 @inline_kernel

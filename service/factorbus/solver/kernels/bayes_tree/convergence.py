@@ -97,7 +97,7 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
     if unconverged and put_off:
         state[tl.S_DUE] = 1
     state[tl.S_AFTER] = 0
-    if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * totals[tl.T_BEFORE] + LEAST_CHI2:
+    if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * totals[tl.T_WHOLE] + LEAST_CHI2:
         state[tl.S_AFTER] += tl.WORSE
     if state[tl.S_RISES] != 0:
         state[tl.S_AFTER] += tl.ROSE

@@ -33,6 +33,8 @@ FEWEST = 256  # that are considered
 CHORD = 3.0  # times what back-substitution takes: there is the forward solve as well
 TRIES = 200  # cliques that are looked at from the root down, at most
 ENOUGH = 0.75  # of the budget: where less of it is used there may be another round
+# Times χ² of before, from which on it is found out in the same step whether what is behind is all there is to it.
+MOST_RISE = 10.0
 RETRY = 16  # steps without a try after one in which there was nothing to choose
 # What becomes of a clique: it is not wanted; wanted; taken; taken with all that is wanted below it.
 UNWANTED, WANTED, TAKEN, WHOLE = 0, 1, 2, 3
@@ -44,7 +46,7 @@ def choose_due(graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
     first.  All of them, if they fit.
     """
     state = tree.state
-    if not may_try(state):
+    if not may_try(state) or state[tl.S_BEHIND] != 0:
         return tree.pending[:0].copy()
     moving = choose_among(list_considered(graph, tree, -1.0, settings), graph, tree, f1, settings)
     if moving.size == state[tl.S_PENDING]:
@@ -224,6 +226,12 @@ def fits_chord_step(tree: Tree, budget: float) -> bool:
     state = tree.state
     work = SCANNING * state[tl.S_FACTORS] + CHORD * SOLVING * state[tl.S_CHANGED]
     return tree.totals[tl.T_WORK] + work <= budget
+
+
+@inline_kernel
+def is_torn_apart(state: I64, totals: F64) -> bool:
+    """Whether a part of the map is behind, and χ² so large that the others may not be where they should be."""
+    return state[tl.S_BEHIND] != 0 and not totals[tl.T_CHI2] <= MOST_RISE * (totals[tl.T_WHOLE] + LEAST_CHI2)
 
 
 @inline_kernel

@@ -177,11 +177,20 @@ def substitute_and_measure(graph: Graph, tree: Tree, tops: I64, ids: I64, settin
     substitute(graph, tree, begins, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked, settings[tl.P_BUDGET])
     totals[tl.T_CHI2] += totals[tl.T_ADDED]
     totals[tl.T_BEFORE] += totals[tl.T_ADDED]
+    totals[tl.T_WHOLE] += totals[tl.T_ADDED]
     totals[tl.T_ADDED_UP] += totals[tl.T_ADDED]
     totals[tl.T_ADDED] = 0.0
     weighted_error = measure(graph, tree, settings)
     lap(now, tl.SUBSTITUTE, state)
     return weighted_error, tl.DONE
+
+
+@part
+def follow_up(graph: Graph, tree: Tree, settings: F64) -> float:
+    """Solve what was left behind, whatever it takes; gives Σ error² as `measure` does."""
+    unbounded, none = settings.copy(), np.empty(0, np.int64)
+    unbounded[tl.P_BUDGET] = np.inf
+    return substitute_and_measure(graph, tree, none, none, unbounded)[0]
 
 
 @part

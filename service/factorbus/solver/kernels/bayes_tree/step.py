@@ -35,11 +35,12 @@ from factorbus.solver.kernels.bayes_tree.defer import (
     RETRY,
     choose_due,
     fits_chord_step,
+    is_torn_apart,
     list_moving,
     may_go_on,
     may_try,
 )
-from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, lap
+from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, follow_up, lap
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearize
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2, residual_unit, scale_thresholds
@@ -118,10 +119,14 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW], state[tl.S_EDITED] = f1, v1, 0
         state[tl.S_ROUNDS] += 1
+        if is_torn_apart(state, totals):
+            weighted_error = follow_up(graph, tree, scaled)
         chi2 = totals[tl.T_CHI2]
         if state[tl.S_ROUNDS] > 1:
             totals[tl.T_GAINED] = max(totals[tl.T_GAINED], before - chi2)
         totals[tl.T_GAINED] = max(totals[tl.T_GAINED], totals[tl.T_BEFORE] - chi2)
+        if state[tl.S_BEHIND] != 0:  # what is torn is not relinearized, and its χ² says nothing
+            break
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
             break
@@ -151,6 +156,8 @@ def note_before(v1: int, f1: int, state: I64, totals: F64) -> None:
     totals[tl.T_LARGEST_DIAGONAL_BEFORE] = totals[tl.T_LARGEST_DIAGONAL]
     totals[tl.T_UNIT], totals[tl.T_BEFORE] = residual_unit(f1, totals), totals[tl.T_CHI2]
     totals[tl.T_GAINED] = totals[tl.T_WORK] = 0.0
+    if state[tl.S_BEHIND] == 0:
+        totals[tl.T_WHOLE] = totals[tl.T_CHI2]
     state[tl.S_OLD], state[tl.S_RISES] = state[tl.S_FIRST_NEW], 0
     nothing_new = v1 == state[tl.S_FIRST_NEW] and f1 == state[tl.S_TAKEN] and state[tl.S_EDITED] == 0
     state[tl.S_CONTINUES] = 1 if nothing_new else 0
