@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
+from bench.every import hard
+from bench.every.motion import PLANE, SPACE
 from naive.random_graphs import random_steps
 from naive.solver_parts import graph_in, has_nothing_new
 from naive.tree_records import assert_is_a_tree, cliques, tree_of
@@ -266,3 +268,25 @@ def unheld(loose: Batch, n: int) -> Batch:
 def test_a_budget_is_a_finite_number(budget: object) -> None:
     with pytest.raises(errors.BadOption, match="step_budget"):
         Options(step_budget=budget)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("budget", [1e5, 3e6])
+@pytest.mark.parametrize(("world", "seed"), [("meetings", 2), ("meetings", 3), ("late", 2), ("drift", 2)])
+def test_where_much_turns_a_map_with_a_budget_does_not_run_away(world: str, seed: int, budget: float) -> None:
+    """A Gauss-Newton step leads far away there, and Levenberg-Marquardt has to follow before the next poses come."""
+    batches = list(hard_steps(world, seed))
+    solver, free = Solver(Options(step_budget=budget)), Solver()
+    for batch in batches:
+        for each in (solver, free):
+            each.stage(batch)
+            each.step()
+        assert np.abs(graph_in(solver).values).max() < 1e4
+    assert left_alone(solver).chi2 == pytest.approx(left_alone(free).chi2, rel=1e-6)
+
+
+def hard_steps(world: str, seed: int) -> Iterator[Batch]:
+    if world == "drift":
+        return hard.drift(150, seed)
+    if world == "late":
+        return hard.late_positions(PLANE, 150, seed)
+    return hard.meetings(SPACE, 150, seed)

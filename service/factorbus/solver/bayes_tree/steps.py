@@ -16,6 +16,7 @@ from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.convergence import FINISHED
+from factorbus.solver.kernels.bayes_tree.defer import MOST_RISE
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -94,7 +95,7 @@ class TreeSteps:
             bounded = tree.set_budget(0.0) and not tree.state.item(tl.S_CONTINUES)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
-        if not settle and (self._is_torn or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
+        if not settle and ((bounded and self._is_tolerable) or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
             self._damping = 0.0
             return self._report(started, compiled, None, because, budget if bounded else 0.0)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
@@ -159,9 +160,12 @@ class TreeSteps:
         return self._gained < -least or (self._gained <= least and self.unfinished)
 
     @property
-    def _is_torn(self) -> bool:
-        """Whether the tree's last step left a part of the map behind, so that its χ² says nothing yet."""
-        return self._tree.behind and math.isfinite(self._tree.totals.item(tl.T_CHI2))
+    def _is_tolerable(self) -> bool:
+        """Whether the tree's last step, which had a budget, may stand though χ² rose: it has none for
+        Levenberg-Marquardt on all of Λ, and those that follow, or one with nothing new, see to it.
+        """
+        chi2 = self._tree.totals.item(tl.T_CHI2)
+        return math.isfinite(chi2) and chi2 <= MOST_RISE * (self._tree.totals.item(tl.T_WHOLE) + LEAST_CHI2)
 
     @property
     def _gained(self) -> float:
@@ -217,7 +221,9 @@ class TreeSteps:
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and chi2_before - result.chi2 <= _AT_END * (result.chi2 + LEAST_CHI2):
                 result.converged = True
-            if result:  # of the optimum of a batch that has not converged nothing is known
+            if result:
+                tree.totals[tl.T_WHOLE], tree.state[tl.S_AFTER] = tree.totals[tl.T_CHI2], 0
+                # Of the optimum of a batch that has not converged nothing is known.
                 tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2] if result.converged else 0.0
                 self._damping = 0.0 if result.converged else result.damping
             # The tree's own step followed, and what it was before is that of the step.
@@ -293,7 +299,8 @@ class TreeSteps:
         reported = self._tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        model, chi2, _, error, allowed, chi2_before, *_, least, _, _, work, _ = self._tree.totals.tolist()
+        totals = self._tree.totals.tolist()
+        model, chi2, _, error, allowed, chi2_before = totals[: tl.T_BEFORE + 1]
         chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
         behind = self._tree.behind
         share = self._options.converged_share
@@ -324,8 +331,10 @@ class TreeSteps:
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
             self._tree.deferred,
-            0.0 if result and result.converged else min(error + (chi2 - model if behind else 0.0), chi2 - least),
-            work,
+            0.0 if result and result.converged else min(
+                error + (max(chi2 - model, 0.0) if behind else 0.0), chi2 - totals[tl.T_LEAST]
+            ),
+            totals[tl.T_WORK],
             budget,
         ))  # fmt: skip
 

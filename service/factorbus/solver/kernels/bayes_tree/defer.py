@@ -33,9 +33,12 @@ FEWEST = 256  # that are considered
 CHORD = 3.0  # times what back-substitution takes: there is the forward solve as well
 TRIES = 200  # cliques that are looked at from the root down, at most
 ENOUGH = 0.75  # of the budget: where less of it is used there may be another round
-# Times χ² of before, from which on it is found out in the same step whether what is behind is all there is to it.
+# Times χ² of before, from which on it is found out in the same step whether what is behind is all there is to it, and
+# Levenberg-Marquardt follows where it is not.
 MOST_RISE = 10.0
-RETRY = 16  # steps without a try after one in which there was nothing to choose
+# Steps without a try after one that left more than this share of all errors, or that took less than this share of its
+# budget and found nothing to choose.
+RETRY, USEFUL, ROOMY = 8, 0.9, 0.5
 # What becomes of a clique: it is not wanted; wanted; taken; taken with all that is wanted below it.
 UNWANTED, WANTED, TAKEN, WHOLE = 0, 1, 2, 3
 
@@ -229,9 +232,26 @@ def fits_chord_step(tree: Tree, budget: float) -> bool:
 
 
 @inline_kernel
+def is_in_vain(budget: float, state: I64, totals: F64) -> bool:
+    """Whether a part of what was due already was relinearized, and all errors are hardly less than before: where one
+    part meets the next both have errors; or there was room for it, and nothing to choose.
+    """
+    if state[tl.S_RELINEARIZED] > 0:
+        was = totals[tl.T_ERROR_BEFORE]
+        return state[tl.S_BEHIND] == 0 and was > totals[tl.T_ALLOWED] and totals[tl.T_ERROR] > USEFUL * was
+    return state[tl.S_WAS_BEHIND] == 0 and may_try(state) and totals[tl.T_WORK] < ROOMY * budget
+
+
+@inline_kernel
 def is_torn_apart(state: I64, totals: F64) -> bool:
     """Whether a part of the map is behind, and χ² so large that the others may not be where they should be."""
-    return state[tl.S_BEHIND] != 0 and not totals[tl.T_CHI2] <= MOST_RISE * (totals[tl.T_WHOLE] + LEAST_CHI2)
+    return state[tl.S_BEHIND] != 0 and not is_tolerable(totals)
+
+
+@inline_kernel
+def is_tolerable(totals: F64) -> bool:
+    """Whether χ² may be above what it was while a step has a budget."""
+    return totals[tl.T_CHI2] <= MOST_RISE * (totals[tl.T_WHOLE] + LEAST_CHI2)
 
 
 @inline_kernel

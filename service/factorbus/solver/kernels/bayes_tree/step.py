@@ -35,10 +35,10 @@ from factorbus.solver.kernels.bayes_tree.defer import (
     RETRY,
     choose_due,
     fits_chord_step,
+    is_in_vain,
     is_torn_apart,
     list_moving,
     may_go_on,
-    may_try,
 )
 from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, follow_up, lap
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
@@ -77,7 +77,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         status = begin_step(graph, tree)
         if status != tl.DONE:
             return status
-        note_before(v1, f1, state, totals)
+        note_before(v1, f1, settings[tl.P_BUDGET] < math.inf, state, totals)
     scaled = scale_thresholds(f1, graph.counts[at.SCALARS], settings, state, totals)
     if state[tl.S_CONTINUES] != 0:
         scaled[tl.P_BUDGET] = math.inf
@@ -144,19 +144,20 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     changed = tree.changed[: state[tl.S_CHANGED]]
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
-    if put_off and state[tl.S_RELINEARIZED] == 0 and may_try(state):
+    if put_off and is_in_vain(scaled[tl.P_BUDGET], state, totals):
         state[tl.S_TRY_AT] = state[tl.S_STEP] + RETRY
     note_after(settings, state, totals)
     return tl.DONE
 
 
 @inline_kernel
-def note_before(v1: int, f1: int, state: I64, totals: F64) -> None:
+def note_before(v1: int, f1: int, bounded: bool, state: I64, totals: F64) -> None:
     """How things are when a step begins that is up to v1 variables and f1 factors."""
     totals[tl.T_LARGEST_DIAGONAL_BEFORE] = totals[tl.T_LARGEST_DIAGONAL]
     totals[tl.T_UNIT], totals[tl.T_BEFORE] = residual_unit(f1, totals), totals[tl.T_CHI2]
     totals[tl.T_GAINED] = totals[tl.T_WORK] = 0.0
-    if state[tl.S_BEHIND] == 0:
+    state[tl.S_WAS_BEHIND], totals[tl.T_ERROR_BEFORE] = state[tl.S_BEHIND], totals[tl.T_ERROR]
+    if state[tl.S_BEHIND] == 0 and not (bounded and state[tl.S_AFTER] & (tl.WORSE + tl.ROSE) != 0):
         totals[tl.T_WHOLE] = totals[tl.T_CHI2]
     state[tl.S_OLD], state[tl.S_RISES] = state[tl.S_FIRST_NEW], 0
     nothing_new = v1 == state[tl.S_FIRST_NEW] and f1 == state[tl.S_TAKEN] and state[tl.S_EDITED] == 0
