@@ -261,6 +261,7 @@ def test_a_refused_step_leaves_what_waits_as_it_was() -> None:
 def unheld(loose: Batch, n: int) -> Batch:
     """A pose of its own that nothing holds."""
     group = loose.variables[0]
+    assert group.values is not None
     return Batch((group._replace(keys=np.array([-1000 - n]), values=group.values[:1], fixed=False),), ())
 
 

@@ -171,7 +171,7 @@ def take_subtrees(left: float, work: F64, gain: F64, fate: I64, clique: I64, wan
         c, n = edge[best], n - 1
         edge[best] = edge[n]
         if work[c] <= left:
-            left -= work[c]
+            left -= float(work[c])
             fate[c] = WHOLE
             continue
         own = work_of_clique(clique[c]) if fate[c] == WANTED else 0.0
