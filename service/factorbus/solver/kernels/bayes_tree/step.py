@@ -125,7 +125,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         if state[tl.S_ROUNDS] > 1:
             totals[tl.T_GAINED] = max(totals[tl.T_GAINED], before - chi2)
         totals[tl.T_GAINED] = max(totals[tl.T_GAINED], totals[tl.T_BEFORE] - chi2)
-        if state[tl.S_BEHIND] != 0:  # what is torn is not relinearized, and its χ² says nothing
+        if state[tl.S_BEHIND] != 0:  # χ² of what is torn says nothing
             break
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
