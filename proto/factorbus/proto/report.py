@@ -9,9 +9,9 @@ _COUNTS = (
     "closures", "suspects",
     "iterations", "new_variables", "new_factors", "changed", "relinearized", "eliminated", "nnz_r", "flops", "inactive",
     "points", "removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables",
-    "placed_variables", "added_factors",
+    "placed_variables", "added_factors", "deferred_relinearizations",
 )  # fmt: skip
-_NUMBERS = ("chi2", "chi2_before", "damping", "step_ms", "solver_ms", "compiled_ms")
+_NUMBERS = ("chi2", "chi2_before", "damping", "step_ms", "solver_ms", "compiled_ms", "unsolved", "work", "budget")
 
 
 class Report(dict[str, Any]):

@@ -10,6 +10,7 @@ from factorbus.solver.errors import BadOption
 
 # Counts go into float64 settings of the kernels, where whole numbers beyond this are no longer exact.
 _MOST_COUNT = 2**53
+MOST_BUDGET = 1e15  # of a step: weeks
 _MOST_NUMBER = int(sys.float_info.max)
 
 
@@ -69,6 +70,7 @@ RANGES = types.MappingProxyType(
         "relinearize_cooldown_factor": _FINITE,
         "relinearize_cooldown_flops": _FACTOR,
         "max_rounds": _count(1),
+        "step_budget": Range(0.0, MOST_BUDGET),
         "converged_share": _FINITE,
         "wildfire_threshold": _SHARE,
         "constrain_recent_steps": _count(0),

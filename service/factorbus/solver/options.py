@@ -31,6 +31,10 @@ class Options:
                     up to ten rounds until it has, and one that raised χ² by more is replaced by Levenberg-Marquardt
                     from where the estimate stood
     max_rounds      bayes-tree: linear problems solved in one step, at most, once the step has converged
+    step_budget     bayes-tree: what a step with something new may take, in units of which 10⁸ are about a millisecond
+                    (MATH §9.10); 0: there is no bound.  New variables and factors are always eliminated, whatever that
+                    takes; relinearization, what is far from the newest pose, and Levenberg-Marquardt where χ² rose wait
+                    for later steps where they do not fit.  A step with nothing new, or that settles, has no bound
     batch_tolerance all-batch: an ordinary step stops when the next one would lower χ² by less than this share of it
     incremental_tolerance   inc-l: the same, and a first step that would is not made.  The paper's tol, with the length
                     of δ measured in standard deviations: |δ|² = δᵀΛδ = dᵀd ≤ tol χ²  (MATH §8.5)
@@ -49,6 +53,7 @@ class Options:
     wildfire_threshold: float = 0.01
     converged_share: float = 5e-4
     max_rounds: int = 3
+    step_budget: float = 0.0
     batch_tolerance: float = 1e-6
     incremental_tolerance: float = 5e-5
     max_iterations: int = 10

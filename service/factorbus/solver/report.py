@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+_OF_A_BUDGET = ("deferred_relinearizations", "unsolved", "work", "budget")
 _NONE: Mapping[str, float] = MappingProxyType({})
 
 
@@ -30,6 +31,10 @@ class StepReport(NamedTuple):
                  tolerance
     phases_ms    milliseconds by phase;  step_ms: the whole step;  compiled_ms: the part of it within one compiled call,
                  where that does the work (mode "bayes-tree"), else None
+    deferred_relinearizations   variables that are due to be relinearized in a later step (mode "bayes-tree")
+    unsolved     what χ² may be above the optimum of this map: what `converged` goes by, and what a step with a budget
+                 left where it was (mode "bayes-tree")
+    work, budget what the step took and what it might take, in the units of `Options.step_budget`; 0: it had no bound
     """
 
     mode: str
@@ -51,6 +56,10 @@ class StepReport(NamedTuple):
     phases_ms: Mapping[str, float] = _NONE
     step_ms: float = 0.0
     compiled_ms: float | None = None
+    deferred_relinearizations: int = 0
+    unsolved: float = 0.0
+    work: float = 0.0
+    budget: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
@@ -59,6 +68,9 @@ class StepReport(NamedTuple):
         shown["phases_ms"] = phases.as_dict() if isinstance(phases, PhaseShares) else dict(phases)
         if self.compiled_ms is None:
             del shown["compiled_ms"]
+        if not self.budget:
+            for name in _OF_A_BUDGET:
+                del shown[name]
         return shown
 
 

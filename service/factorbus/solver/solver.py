@@ -70,13 +70,15 @@ class Solver:
         """
         return admit(self._graph, batch)
 
-    def step(self, settle: bool = False) -> StepReport:
+    def step(self, settle: bool = False, budget: float | None = None) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
+
+        budget: in the place of `Options.step_budget`, for this step.
 
         Raises Underconstrained or NotFinite; what was staged since the last step is taken back then, and the solver is
         as it was after that step, bit for bit.
         """
-        return self._stepper.step(settle)
+        return self._stepper.step(settle, self._options.step_budget if budget is None else budget)
 
     def estimate(self) -> list[Group]:
         """A copy of all values: per kind, in insertion order, fixed variables in groups of their own.

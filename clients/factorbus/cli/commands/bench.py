@@ -17,6 +17,7 @@ ASKED = (
     "aligning",
     "ask",
     "batch",
+    "budget",
     "closures",
     "digest",
     "calibration",
@@ -61,6 +62,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
                units of its covariance; --seeds, --only
     aligning   two maps into one frame, of candidates of which most are false: how often right, wrong, left open;
                --draws, --only
+    budget     steps with a budget beside the same steps without one: their time, χ² meanwhile, the newest pose, steps
+               until nothing is left for later; --only, --poses, --budget-ms
     closures   false loop closures, online: streets with shares of false ones (random, local, grouped), tested as they
                come, beside the same solver without a test and with Huber, Cauchy and DCS losses; half an hour
                without the others, hours with; --draws, --only, --shares, --rivals

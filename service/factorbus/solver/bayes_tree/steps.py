@@ -16,6 +16,7 @@ from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.convergence import FINISHED
+from factorbus.solver.kernels.bayes_tree.defer import MOST_RISE
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -72,11 +73,12 @@ class TreeSteps:
         """How much of the graph there was after the last step."""
         return self._mark
 
-    def step(self, settle: bool) -> StepReport:
+    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
         """As `Solver.step`."""
         clock = self._options.clock
         started = clock() if clock else 0.0
         tree, because = self._tree, ""
+        tree.set_budget(0.0 if settle else budget)
         try:
             status = tree.step()
             if status == tl.UNSURE:
@@ -89,13 +91,15 @@ class TreeSteps:
         except BaseException:
             self._graph.forget(self._mark)
             raise
+        finally:
+            bounded = tree.set_budget(0.0) and not tree.state.item(tl.S_CONTINUES)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
-        if not settle and not tree.state.item(tl.S_AFTER) and not self._stalls:
+        if not settle and ((bounded and self._is_tolerable) or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
             self._damping = 0.0
-            return self._report(started, compiled, None, because)
+            return self._report(started, compiled, None, because, budget if bounded else 0.0)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
-        return self._report(started, compiled, result, because)
+        return self._report(started, compiled, result, because, budget if bounded else 0.0)
 
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
@@ -141,6 +145,8 @@ class TreeSteps:
         _, chi2, _, error, _, _, _, left, *_ = self._tree.totals.tolist()
         share = max(chi2, 0.0) + LEAST_CHI2
         scalars = int(self._graph.counts[at.SCALARS])
+        if self._tree.behind:
+            return True
         if self._at_linearization or self._tree.raised:
             return not self._is_within(_AT_END, chi2)
         return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
@@ -152,6 +158,14 @@ class TreeSteps:
             return False
         least = FINISHED * self._share
         return self._gained < -least or (self._gained <= least and self.unfinished)
+
+    @property
+    def _is_tolerable(self) -> bool:
+        """Whether the tree's last step, which had a budget, may stand though χ² rose: it has none for
+        Levenberg-Marquardt on all of Λ, and those that follow, or one with nothing new, see to it.
+        """
+        chi2 = self._tree.totals.item(tl.T_CHI2)
+        return math.isfinite(chi2) and chi2 <= MOST_RISE * (self._tree.totals.item(tl.T_WHOLE) + LEAST_CHI2)
 
     @property
     def _gained(self) -> float:
@@ -198,7 +212,8 @@ class TreeSteps:
         if settle or worse or rises or goes_on or self._stalls:
             tree.exchange()
             before = self._graph.values.copy()
-            if not worse and not (continues and self._gained < 0.0):
+            # After a torn estimate a whole one may have the lower χ², and be worse than when nothing was behind.
+            if not (worse and not chi2 <= chi2_before) and not (continues and self._gained < 0.0):
                 tree.exchange()
             result = self._batch(before, settle, continues)
             reasons = (settle, _ASKED), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON), (True, _STALLS)
@@ -206,7 +221,9 @@ class TreeSteps:
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and chi2_before - result.chi2 <= _AT_END * (result.chi2 + LEAST_CHI2):
                 result.converged = True
-            if result:  # of the optimum of a batch that has not converged nothing is known
+            if result:
+                tree.totals[tl.T_WHOLE], tree.state[tl.S_AFTER] = tree.totals[tl.T_CHI2], 0
+                # Of the optimum of a batch that has not converged nothing is known.
                 tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2] if result.converged else 0.0
                 self._damping = 0.0 if result.converged else result.damping
             # The tree's own step followed, and what it was before is that of the step.
@@ -273,17 +290,21 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _report(self, started: float, compiled: float, result: Minimization | None, because: str) -> StepReport:
+    def _report(
+        self, started: float, compiled: float, result: Minimization | None, because: str, budget: float = 0.0
+    ) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], result is not None
         reported = self._tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        _, chi2, _, error, allowed, chi2_before = self._tree.totals[: tl.T_BEFORE + 1].tolist()
+        totals = self._tree.totals.tolist()
+        model, chi2, _, error, allowed, chi2_before = totals[: tl.T_BEFORE + 1]
         chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
+        behind = self._tree.behind
         share = self._options.converged_share
-        converged = result.converged if result else error <= allowed
+        converged = result.converged if result else error <= allowed and not behind
         if not result and self._tree.raised:
             converged &= self._is_within(share, chi2)
         converged = converged or (not result and not self.unfinished)
@@ -309,6 +330,12 @@ class TreeSteps:
             PhaseShares(tl.PHASES, reported[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
+            self._tree.deferred,
+            0.0 if result and result.converged else min(
+                error + (max(chi2 - model, 0.0) if behind else 0.0), chi2 - totals[tl.T_LEAST]
+            ),
+            totals[tl.T_WORK],
+            budget,
         ))  # fmt: skip
 
 

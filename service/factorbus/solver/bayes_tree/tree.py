@@ -3,6 +3,7 @@
 This is the memory of `kernels/bayes_tree/step.py`, which does the work in one call; here is what grows.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -22,6 +23,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.task_queue import NOBODY
+from factorbus.solver.option_ranges import MOST_BUDGET
 from factorbus.solver.options import Options
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 
@@ -47,6 +49,14 @@ class CliqueTree(Arenas):
             yield
         finally:
             self.settings[tl.P_INITIALIZE] = place
+
+    def set_budget(self, budget: float) -> bool:
+        """What the steps that follow may take, in units of work (`kernels/bayes_tree/work.py`), before they defer the
+        rest; 0: without bound.  Gives whether those before had one.
+        """
+        was = self.settings.item(tl.P_BUDGET)
+        self.settings[tl.P_BUDGET] = budget if 0.0 < budget <= MOST_BUDGET else math.inf
+        return was < math.inf
 
     def clear(self) -> None:
         """Let go of everything: the next step takes in the whole graph."""
@@ -93,6 +103,16 @@ class CliqueTree(Arenas):
     def raised(self) -> bool:
         """Whether pivots were raised, so that R alone does not lead to the optimum."""
         return bool(self.state[tl.S_RAISED])
+
+    @property
+    def deferred(self) -> int:
+        """Variables that were due to be relinearized in the last step, and were not."""
+        return int(self.state[tl.S_PENDING]) if self.state[tl.S_DUE] else 0
+
+    @property
+    def behind(self) -> bool:
+        """Whether back-substitution left a part of the map where it was."""
+        return bool(self.state[tl.S_BEHIND])
 
     @property
     def failed(self) -> int:
@@ -181,6 +201,7 @@ def settings_of(options: Options) -> F64:
     settings[tl.P_WILDFIRE_THRESHOLD] = options.wildfire_threshold
     settings[tl.P_RELINEARIZE_THRESHOLD] = options.relinearize_threshold
     settings[tl.P_CONVERGED], settings[tl.P_MAX_ROUNDS] = options.converged_share, options.max_rounds
+    settings[tl.P_BUDGET] = math.inf
     settings[tl.P_INITIALIZE] = _FEW if options.initialize_locally else -1
     settings[tl.P_CHI2_EPSILON] = tuning.chi2_epsilon
     settings[tl.P_NEXT_STEP_SHARE] = tuning.relinearize_next_step_share

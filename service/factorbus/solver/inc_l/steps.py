@@ -79,7 +79,7 @@ class IncrementalSteps:
         """For tests."""
         return self._system
 
-    def step(self, settle: bool) -> StepReport:
+    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
         """As `Solver.step`."""
         return self._step(settle, self._options.initialize_locally)
 

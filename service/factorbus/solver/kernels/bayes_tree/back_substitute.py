@@ -12,6 +12,7 @@ from factorbus.solver.kernels.bayes_tree import rigid_subtrees as rg
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, move_variable, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
+from factorbus.solver.kernels.bayes_tree.work import SOLVING, note_work, work_of_solving
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
@@ -19,17 +20,24 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
 QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn with a smaller error is not counted
+LEAST_SHARE = 0.125  # of the budget, which back-substitution has whatever came before it
+SURROUNDINGS = 16  # levels of the tree below the root, which come before what is further down
+ALL_LEVELS = 1 << 62
+MOST_TORN = 50  # steps in a row that leave something behind: then one does not, whatever it takes, so that χ² is known
 NARROW = 16.0  # numbers of R a scalar; where there are more, separators may be further off
 
 
 @part
-def substitute(graph: Graph, tree: Tree, ids: I64, wildfire_threshold: float, quiet: float, listed: I64) -> None:
+def substitute(
+    graph: Graph, tree: Tree, ids: I64, wildfire_threshold: float, quiet: float, listed: I64, budget: float
+) -> None:
     """Solve the new cliques and whatever moves with them.
 
     changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2] gets what they
     were.  moved: gets them all since their factors were evaluated last.  listed: scratch, for all cliques.  T_LEFT gets
     the largest square by which a separator that was left alone is off.  wildfire_threshold 0: no separator is left
-    alone, nor one that was so below a clique that does not move now
+    alone, nor one that was so below a clique that does not move now.  budget: of the step, see `work`; where it is used
+    what was there before stays behind, what is furthest from the root first
     """
     var = graph.var
     clique, lists, numbers, lin = tree.clique, tree.lists, tree.numbers, tree.lin
@@ -41,33 +49,78 @@ def substitute(graph: Graph, tree: Tree, ids: I64, wildfire_threshold: float, qu
     motion[rg.LEFT] = 0.0
     shares = np.empty(64)
     body = count = 0
-    for f in range(ids.size - 1, -1, -1):
-        if clique[ids[f], tl.C_PARENT] >= 0:
-            continue
-        c = ids[f]
-        while c >= 0:
-            row = clique[c]
-            gather_separator(row, var, lists, delta, numbers)
-            if row[tl.C_PIVOTS] > shares.size:
-                shares = np.empty(2 * row[tl.C_PIVOTS])
-            solve_rows(row, numbers, shares)
-            row[tl.C_FIRST] = row[tl.C_MOVES] = 0
-            state[tl.S_SOLVED] += 1
-            move_frontals(graph, tree, row, delta, lin[0], lin[2])
-            child, above = row[tl.C_CHILD], c
-            while True:
-                c = next_clique(graph, tree, child, above, far, delta, weight, motion)
-                if c < 0 or not moves_along(graph, tree, c, far, delta, weight, motion):
-                    break
-                # What is in it nobody outside looks at, so it can move later.
-                if body == rg.BODIES:
-                    rg.move_bodies(graph, tree, listed[:count], quiet, delta, lin[2], motion)
-                    body = count = 0
-                count = rg.list_subtree(c, body, clique, motions, motion, listed, count)
-                body += 1
-                child, above = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
-    rg.move_bodies(graph, tree, listed[:count], quiet, delta, lin[2], motion)
+    work, bounded = 0.0, budget < np.inf and state[tl.S_BEHIND] < MOST_TORN
+    limit = max(budget - totals[tl.T_WORK], LEAST_SHARE * budget)
+    level = np.empty(len(clique) if bounded else 0, np.int64)
+    for turn in range(2 if bounded else 1):
+        deepest = SURROUNDINGS if bounded and turn == 0 else ALL_LEVELS
+        for f in range(ids.size - 1, -1, -1):
+            if clique[ids[f], tl.C_PARENT] >= 0 or (turn > 0 and clique[ids[f], tl.C_MOVES] & tl.BEHIND == 0):
+                continue
+            c = ids[f]
+            if bounded:
+                level[c] = 0
+            while c >= 0:
+                row = clique[c]
+                if turn > 0 and c == ids[f]:
+                    row[tl.C_MOVES] &= tl.MOVED
+                else:
+                    gather_separator(row, var, lists, delta, numbers)
+                    if row[tl.C_PIVOTS] > shares.size:
+                        shares = np.empty(2 * row[tl.C_PIVOTS])
+                    solve_rows(row, numbers, shares)
+                    row[tl.C_FIRST] = row[tl.C_MOVES] = 0
+                    state[tl.S_SOLVED] += 1
+                    work += work_of_solving(row)
+                    move_frontals(graph, tree, row, delta, lin[0], lin[2])
+                child, above = row[tl.C_CHILD], c
+                while True:
+                    c = next_clique(graph, tree, child, above, far, delta, weight, motion)
+                    if c < 0:
+                        break
+                    row, child, above = clique[c], clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
+                    if bounded:
+                        level[c] = level[above] + 1
+                        if row[tl.C_FIRST] != -1 and (work >= limit or level[c] > deepest):
+                            rg.leave_behind(above, clique)
+                            continue
+                    behind = row[tl.C_MOVES] & tl.BEHIND != 0
+                    if behind and row[tl.C_FIRST] != -1 and not has_moved(graph, tree, c, far, delta, weight, motion):
+                        row[tl.C_MOVES] &= tl.MOVED
+                        child, above = row[tl.C_CHILD], c
+                        continue
+                    if not moves_along(graph, tree, c, far, delta, weight, motion):
+                        break
+                    # What is in it nobody outside looks at, so it can move later.
+                    if body == rg.BODIES:
+                        rg.move_bodies(graph, tree, listed[:count], quiet, delta, lin[2], motion)
+                        body = count = 0
+                    end = count + int((limit - work) / SOLVING) + 1 if bounded else listed.size + 1
+                    before = count
+                    count = rg.list_subtree(c, body, clique, motions, motion, listed, count, end)
+                    work += SOLVING * (count - before)
+                    body += 1
+                    if behind:
+                        rg.leave_behind(above, clique)
+        rg.move_bodies(graph, tree, listed[:count], quiet, delta, lin[2], motion)
+        body = count = 0
+        if work >= limit:
+            break
     totals[tl.T_LEFT] = max(totals[tl.T_LEFT] if wildfire_threshold > 0.0 else 0.0, motion[rg.LEFT])
+    note_work(work, totals)
+    note_behind(ids, clique, state)
+
+
+@inline_kernel
+def note_behind(ids: I64, clique: I64, state: I64) -> None:
+    """Whether anything below the roots among `ids` was left behind, or below others."""
+    roots, behind = 0, False
+    for f in range(ids.size):
+        if clique[ids[f], tl.C_PARENT] < 0:
+            roots += 1
+            behind |= clique[ids[f], tl.C_MOVES] & tl.BEHIND != 0
+    if behind or roots == state[tl.S_ROOTS]:
+        state[tl.S_BEHIND] = state[tl.S_BEHIND] + 1 if behind else 0
 
 
 @inline_kernel
@@ -87,16 +140,29 @@ def moves_along(graph: Graph, tree: Tree, c: int, far: float, delta: F64, weight
 def next_clique(
     graph: Graph, tree: Tree, child: int, above: int, far: float, delta: F64, weight: F64, motion: F64
 ) -> int:
-    """The next clique that has moved, from `child` of clique `above` on, depth first; −1: none is left."""
+    """The next clique that has moved, or has one below it that was left behind, from `child` of `above` on, depth
+    first; −1: none is left.
+    """
     clique = tree.clique
     while True:
         while child >= 0:
-            if clique[child, tl.C_FIRST] == -1 or has_moved(graph, tree, child, far, delta, weight, motion):
+            if is_visited(graph, tree, child, far, delta, weight, motion):
                 return child
             child = clique[child, tl.C_NEXT]
         if clique[above, tl.C_PARENT] < 0:
             return -1
         child, above = clique[above, tl.C_NEXT], clique[above, tl.C_PARENT]
+
+
+@inline_kernel
+def is_visited(graph: Graph, tree: Tree, c: int, far: float, delta: F64, weight: F64, motion: F64) -> bool:
+    """Whether a clique is to be solved, or was passed by with the budget used."""
+    row = tree.clique[c]
+    return (
+        row[tl.C_FIRST] == -1
+        or row[tl.C_MOVES] & tl.BEHIND != 0
+        or has_moved(graph, tree, c, far, delta, weight, motion)
+    )
 
 
 @inline_kernel
@@ -109,7 +175,7 @@ def has_moved(graph: Graph, tree: Tree, c: int, far: float, delta: F64, weight: 
     row = clique[c]
     far = far_of(row, far)
     start = row[tl.C_LIST] + row[tl.C_FRONTALS]
-    used, moves, left = row[tl.C_USED] + row[tl.C_PIVOTS], row[tl.C_MOVES] != 0, 0.0
+    used, moves, left = row[tl.C_USED] + row[tl.C_PIVOTS], row[tl.C_MOVES] & tl.MOVED != 0, 0.0
     for s in range(start, start + row[tl.C_SEPARATORS]):
         v = lists[s]
         d = var[v, at.V_SCALAR]

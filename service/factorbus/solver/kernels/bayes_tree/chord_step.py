@@ -31,6 +31,7 @@ from factorbus.solver.kernels.bayes_tree.missed_residual import (
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
+from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work, work_of_solving
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
 from factorbus.solver.kernels.jit.simd import at as load
@@ -40,6 +41,8 @@ from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, ma
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se3 import rotation_matrix, turn_slope
 from factorbus.solver.kernels.sparse import fronts as fr
+
+FORWARD = 2.0  # times what back-substitution takes: the gradients are gathered as well
 
 
 @inline_kernel
@@ -63,6 +66,7 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     node, clique, state = tree.node, tree.clique, tree.state
     now = cycles()
     # 1
+    note_work(SCANNING * state[tl.S_FACTORS], tree.totals)
     state[tl.S_STAMP] += 1
     scratch, end = make_scratch(), tree.marked.size
     for f in range(state[tl.S_FACTORS]):
@@ -78,7 +82,7 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     now = lap(now, tl.ELIMINATE, state)
     # 3
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
-    substitute(graph, tree, roots, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked)
+    substitute(graph, tree, roots, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked, settings[tl.P_BUDGET])
     # 4
     state[tl.S_DUE], state[tl.S_WAITING], state[tl.S_CHORDS] = 0, state[tl.S_STEP], state[tl.S_CHORDS] + 1
     weighted_error = measure(graph, tree, settings)
@@ -182,9 +186,11 @@ def forward_solve(graph: Graph, tree: Tree, cliques: I64) -> I64:
     """d and the right-hand sides of update matrices anew, in `cliques`, children first; gives those that are roots."""
     var, clique, lists, numbers = graph.var, tree.clique, tree.lists, tree.numbers
     state, totals = tree.state, tree.totals
-    widest, count = 0, 0
+    widest, count, work = 0, 0, 0.0
     for k in range(cliques.size):
+        work += work_of_solving(clique[cliques[k]])
         widest = max(widest, clique[cliques[k], tl.C_PIVOTS] + clique[cliques[k], tl.C_SEPARATOR_SCALARS] + 1)
+    note_work(FORWARD * work, totals)
     eta, roots = np.empty(widest), np.empty(cliques.size, np.int64)
     for k in range(cliques.size):
         row = clique[cliques[k]]

@@ -1,10 +1,13 @@
 """Whether a step goes on, and what is left to do after it.  MATH §9.6."""
 
+import math
+
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.chord_step import error_left
 from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_errors
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
+from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel
 from factorbus.solver.kernels.model.records import Graph
 
@@ -40,6 +43,7 @@ def mark_unconverged(graph: Graph, tree: Tree, settings: F64) -> None:
     """Where Σ error² is more than is allowed, all variables that have a part in it are relinearized next."""
     state, totals = tree.state, tree.totals
     if totals[tl.T_ERROR] > allowed(settings, state, totals):
+        note_work(SCANNING * state[tl.S_FACTORS], totals)
         mark_large_errors(least_error(settings, state, totals), graph, tree)
         state[tl.S_DUE] = 1
 
@@ -86,9 +90,14 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
     """What is to be done after the step, and what the optimum is at least."""
     chi2 = totals[tl.T_CHI2]
     totals[tl.T_ALLOWED] = converged_error(settings, state, totals)
-    state[tl.S_SLOW] = 1 if totals[tl.T_ERROR] > totals[tl.T_ALLOWED] else 0
+    # What a budget has put off says nothing of how fast the others converge.
+    put_off = state[tl.S_PENDING] != 0 and state[tl.S_CONTINUES] == 0 and settings[tl.P_BUDGET] < math.inf
+    unconverged = totals[tl.T_ERROR] > totals[tl.T_ALLOWED]
+    state[tl.S_SLOW] = 1 if unconverged and not put_off else 0
+    if unconverged and put_off:
+        state[tl.S_DUE] = 1
     state[tl.S_AFTER] = 0
-    if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * totals[tl.T_BEFORE] + LEAST_CHI2:
+    if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * totals[tl.T_WHOLE] + LEAST_CHI2:
         state[tl.S_AFTER] += tl.WORSE
     if state[tl.S_RISES] != 0:
         state[tl.S_AFTER] += tl.ROSE

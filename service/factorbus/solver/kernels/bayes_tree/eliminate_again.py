@@ -23,6 +23,7 @@ from factorbus.solver.kernels.bayes_tree.refactor_in_place import commit_renewed
 from factorbus.solver.kernels.bayes_tree.reroot import account_for
 from factorbus.solver.kernels.bayes_tree.thresholds import rescale
 from factorbus.solver.kernels.bayes_tree.touch import NewRows, find_touched
+from factorbus.solver.kernels.bayes_tree.work import RELINEARIZING, note_work, work_of_cliques
 from factorbus.solver.kernels.jit.bit_sets import MOST
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
@@ -90,7 +91,9 @@ def eliminate_again(
     if state[tl.S_EDITED] != 0:
         rescale(new.f1, settings, totals)
     if moving.size > 0:
-        note_relinearized(moving, state[tl.S_FLOPS] - flops, node, state)
+        note_relinearized(moving, state[tl.S_FLOPS] - flops, node, tree.pending, state)
+    note_work(work_of_cliques(ids, clique) + work_of_cliques(renewed, clique), totals)
+    note_work(RELINEARIZING * moving.size, totals)
     lap(now, tl.COMMIT, state)
     return substitute_and_measure(graph, tree, tops, ids, settings)
 
@@ -133,11 +136,17 @@ def order_fronts(
 
 
 @inline_kernel
-def note_relinearized(moving: I64, flops: int, node: I64, state: I64) -> None:
-    """The variables `moving` do not wait any more; flops: what their elimination took."""
+def note_relinearized(moving: I64, flops: int, node: I64, pending: I64, state: I64) -> None:
+    """The variables `moving` do not wait any more, and the others from now on; flops: what their elimination took."""
     for k in range(moving.size):
         node[moving[k], tl.N_FLAGS], node[moving[k], tl.N_LINEARIZED] = FREE, state[tl.S_STEP]
-    state[tl.S_PENDING] = state[tl.S_DUE] = 0
+    left = 0
+    if moving.size < state[tl.S_PENDING]:
+        for k in range(state[tl.S_PENDING]):
+            if node[pending[k], tl.N_FLAGS] != FREE:
+                pending[left] = pending[k]
+                left += 1
+    state[tl.S_PENDING], state[tl.S_DUE], state[tl.S_WAITING] = left, 0, state[tl.S_STEP]
     state[tl.S_RELINEARIZED_AT] = state[tl.S_STEP]
     state[tl.S_RELINEARIZING] = flops
 
@@ -157,21 +166,31 @@ def substitute_and_measure(graph: Graph, tree: Tree, tops: I64, ids: I64, settin
     """Steps 8 and 9, from the renewed cliques `tops` and the new ones `ids`, or from all roots."""
     node, clique, state, totals = tree.node, tree.clique, tree.state, tree.totals
     now = cycles()
-    if state[tl.S_CONTINUES] != 0:
+    behind = state[tl.S_BEHIND] != 0 and (state[tl.S_ROOTS] > 1 or tops.size + ids.size == 0)
+    if state[tl.S_CONTINUES] != 0 or behind:
         begins = list_all_roots(node, clique, state)
     else:
         begins = np.empty(tops.size + ids.size, np.int64)
         for k in range(begins.size):
             begins[k] = tops[k] if k < tops.size else ids[k - tops.size]
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
-    substitute(graph, tree, begins, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked)
+    substitute(graph, tree, begins, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked, settings[tl.P_BUDGET])
     totals[tl.T_CHI2] += totals[tl.T_ADDED]
     totals[tl.T_BEFORE] += totals[tl.T_ADDED]
+    totals[tl.T_WHOLE] += totals[tl.T_ADDED]
     totals[tl.T_ADDED_UP] += totals[tl.T_ADDED]
     totals[tl.T_ADDED] = 0.0
     weighted_error = measure(graph, tree, settings)
     lap(now, tl.SUBSTITUTE, state)
     return weighted_error, tl.DONE
+
+
+@part
+def follow_up(graph: Graph, tree: Tree, settings: F64) -> float:
+    """Solve what was left behind, whatever it takes; gives Σ error² as `measure` does."""
+    unbounded, none = settings.copy(), np.empty(0, np.int64)
+    unbounded[tl.P_BUDGET] = np.inf
+    return substitute_and_measure(graph, tree, none, none, unbounded)[0]
 
 
 @part

@@ -66,7 +66,7 @@ C_PARENT = 7  # -1: a root
 # what it reads of one that has moved,
 C_FIRST = 8  # the first place touched by the elimination C_MARK; -1: not solved yet
 C_ANCHORED = 9  # 1: a factor in it or below says where in the world its variables are
-C_MOVES = 10  # 1: it has moved as a whole since it was solved
+C_MOVES = 10  # the sum of MOVED and BEHIND
 C_SEPARATOR_SCALARS = 11  # m
 C_ROWS = 12  # column j of row i of R is at ROWS + i · LD + j
 C_LD = 13
@@ -80,6 +80,9 @@ C_BLOCK_SIZE = 19
 C_UPDATE_BLOCK_SIZE = 20
 C_LIST_SIZE = 21
 C_WIDTH = 24
+
+# In C_MOVES: it has moved as a whole since it was solved; one below it was left behind where a step's budget was used.
+MOVED, BEHIND = 1, 2
 
 # Entries of `motions`, by clique.
 M_SINCE = 0  # ξ since it was solved, (9.20), MOTION numbers: t, ω
@@ -146,7 +149,10 @@ S_EDITED_AT = 57  # the last step that such factors went before
 S_HOLES = 58  # doubles of `hessian` that no factor has any more
 S_CHORDS = 59  # chord steps of the step
 S_SLOW = 60  # 1: the last step had not converged after its rounds
-S_FREE = 61  # heads of free lists: numbers, then lists
+S_BEHIND = 61  # how many back-substitutions in a row left something behind, as the budget was used
+S_TRY_AT = 62  # before this step no relinearization is looked for: none fitted into the budget
+S_WAS_BEHIND = 63  # S_BEHIND before the step
+S_FREE = 64  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
@@ -182,7 +188,8 @@ P_COOLDOWN_FLOPS = 19  # P_COOLDOWN_STEPS is for a relinearization of this numbe
 P_REROOT_SIZE_AREA = 20  # or times its square, if that is more,
 P_REROOT_RING_RATIO = 21  # in rings, each with all inside it this many times as large as the next one,
 P_REROOT_MAX_EXTRA = 22  # unless that takes more than this share of the elimination in addition
-P_SIZE = 23
+P_BUDGET = 23  # what a step may take, in the units of `work`
+P_SIZE = 24
 
 # The phases of a step, in the order of `step`.
 PHASES = ("linearize", "mark", "order", "symbolic", "eliminate", "commit", "substitute")
@@ -204,4 +211,7 @@ T_LARGEST_DIAGONAL_BEFORE = 11  # and before the step
 T_LEAST = 12  # what the optimum's χ² cannot be below, (9.29)
 T_GAINED = 13  # by how much a round of the last step lowered χ², or all of it, at most
 T_UNIT = 14  # (9.6), as it was before the step
-T_SIZE = 15
+T_WORK = 15  # what the step has taken so far, in the units of `work`
+T_WHOLE = 16  # χ² when last nothing was behind, nor worse than it had been, and of the factors that came since
+T_ERROR_BEFORE = 17  # T_ERROR before the step
+T_SIZE = 18

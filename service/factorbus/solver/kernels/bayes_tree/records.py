@@ -9,7 +9,7 @@ from factorbus.solver.kernels.jit.records import FloatRows, Floats, IntRows, Int
 class Tree(NamedTuple):
     """The arrays of a tree, each from the start of a cache line on; `layout` has their columns and entries.
 
-    settings (23,) float64   thresholds of a step, see P_WILDFIRE_THRESHOLD and so on
+    settings (24,) float64   thresholds of a step, see P_WILDFIRE_THRESHOLD and so on
     node    (n, 16) int64    one row per variable, by its index in the graph
     link    (m, 8) int64     one row per factor, by its id
     clique  (c, 24) int64    one row per clique
@@ -32,7 +32,7 @@ class Tree(NamedTuple):
     motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
     saved   (2 k, SAVED) float64 what the k factors of a step under way change of their variables, for when it fails
     state   int64            counters and the heads of free lists
-    totals  (15,) float64    χ² and sums of errors over all factors, and bounds that follow from them
+    totals  (18,) float64    χ² and sums of errors over all factors, and bounds that follow from them
     """
 
     settings: Floats

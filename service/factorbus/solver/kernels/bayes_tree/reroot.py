@@ -16,6 +16,7 @@ from factorbus.solver.kernels.model.records import Graph
 
 INNERMOST = 30.0  # scalars of the smallest ring, at least
 MOST_RINGS = 60  # each has a group of its own in the order
+NEARBY = 0.25  # of a step's budget, what it may take with what is near
 NO_RING = -1  # what is too far out of the way
 
 
@@ -63,6 +64,7 @@ def touch_near(graph: Graph, tree: Tree, room: int, f1: int, settings: F64, mark
         settings[tl.P_REROOT_RING_RATIO],
     )
     ring, within, scalars = 0, float(room), 0
+    max_extra = min(max_extra, max(0.0, NEARBY * settings[tl.P_BUDGET] - flops_of(marked[:count], clique)))
     while within >= wider * INNERMOST and ring < MOST_RINGS:
         ring, within = ring + 1, within / wider
     for f in range(min(state[tl.S_TAKEN], f1 - 1), f1):

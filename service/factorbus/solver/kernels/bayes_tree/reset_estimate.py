@@ -28,6 +28,7 @@ def reset_to_linearization(graph_table: I64, tree_table: I64) -> None:
     lin, scalars = tree.lin, tree.scalars
     moved = tree.moved
     state, totals = tree.state, tree.totals
+    state[tl.S_BEHIND] = 0
     for v in range(state[tl.S_VARIABLES]):
         x, d, c = var[v, at.V_AT], var[v, at.V_SCALAR], node[v, tl.N_CLIQUE]
         note_moved(MODEL, v, node, moved, state)

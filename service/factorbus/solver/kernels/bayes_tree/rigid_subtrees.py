@@ -71,7 +71,7 @@ def fit_motion(
                 return False
             used += 1
     for a in range(MOTION):
-        motion[FRESH + a] = motion[WHOLE + a] - (load(motions, since + a) if row[tl.C_MOVES] != 0 else 0.0)
+        motion[FRESH + a] = motion[WHOLE + a] - (load(motions, since + a) if row[tl.C_MOVES] & tl.MOVED != 0 else 0.0)
     return True
 
 
@@ -207,11 +207,11 @@ def displace(v: int, var: I64, lin: F64, turns: F64, given: F64, xi: int, motion
 
 
 @part
-def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, listed: I64, count: int) -> int:
+def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, listed: I64, count: int, end: int) -> int:
     """All that was eliminated in clique `top` and below it moves by the new part of `motion`, as body number `body`.
 
-    Its cliques remember that at once, and are listed from `count` on; `move_bodies` moves their variables.  Gives the
-    new count.
+    Its cliques remember that at once, and are listed from `count` on; `move_bodies` moves their variables.  What would
+    be listed from `end` on stays behind.  Gives the new count.
     """
     for a in range(MOTION):
         motion[TABLE + body * MOTION + a] = motion[FRESH + a]
@@ -219,14 +219,17 @@ def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, li
     while True:
         row, since = clique[c], c * tl.M_WIDTH
         for a in range(MOTION):
-            before = load(motions, since + a) if row[tl.C_MOVES] != 0 else 0.0
+            before = load(motions, since + a) if row[tl.C_MOVES] & tl.MOVED != 0 else 0.0
             put(motions, since + a, before + motion[FRESH + a])
-        row[tl.C_MOVES] = 1
+        row[tl.C_MOVES] |= tl.MOVED
         wx, wy, wz = load(motions, since + 3), load(motions, since + 4), load(motions, since + 5)
         put(motions, since + tl.M_BODY, float(body))
         put(motions, since + tl.M_TURN, math.sqrt(wx * wx + wy * wy + wz * wz))
         listed[count] = c
         count += 1
+        if count >= end:
+            leave_behind(c, clique)
+            return count
         if row[tl.C_CHILD] >= 0:
             c = row[tl.C_CHILD]
             continue
@@ -235,6 +238,14 @@ def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, li
         if c == top:
             return count
         c = clique[c, tl.C_NEXT]
+
+
+@inline_kernel
+def leave_behind(c: int, clique: I64) -> None:
+    """Something below clique c may have moved, and was not looked at: the next back-substitution comes by."""
+    while c >= 0 and clique[c, tl.C_MOVES] & tl.BEHIND == 0:
+        clique[c, tl.C_MOVES] |= tl.BEHIND
+        c = clique[c, tl.C_PARENT]
 
 
 @part

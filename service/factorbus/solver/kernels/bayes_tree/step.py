@@ -14,7 +14,10 @@
 10 correct        models and right-hand sides where that is so far that it cannot wait, with R as it is, and 8 and 9
 11 again from 2   while it is so far still
 A step with nothing new goes on from 2 with what waits, and substitutes back through the whole tree.
+One with a budget does of 2, 8, 10 and 11 what fits: what is left goes on in the steps that follow (`defer`).
 """
+
+import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import add_factors, add_variables, remove_added
@@ -28,7 +31,16 @@ from factorbus.solver.kernels.bayes_tree.convergence import (
     may_keep_factor,
     note_after,
 )
-from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, lap
+from factorbus.solver.kernels.bayes_tree.defer import (
+    RETRY,
+    choose_due,
+    fits_chord_step,
+    is_in_vain,
+    is_torn_apart,
+    list_moving,
+    may_go_on,
+)
+from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, follow_up, lap
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearize
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2, residual_unit, scale_thresholds
@@ -65,8 +77,11 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         status = begin_step(graph, tree)
         if status != tl.DONE:
             return status
-        note_before(v1, f1, state, totals)
+        note_before(v1, f1, settings[tl.P_BUDGET] < math.inf, state, totals)
     scaled = scale_thresholds(f1, graph.counts[at.SCALARS], settings, state, totals)
+    if state[tl.S_CONTINUES] != 0:
+        scaled[tl.P_BUDGET] = math.inf
+    bounded = scaled[tl.P_BUDGET] < math.inf
     if state[tl.S_CONTINUES] != 0 and not goes_on_with_it:
         mark_unconverged(graph, tree, scaled)
     v0 = state[tl.S_FIRST_NEW]
@@ -74,8 +89,15 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     if not add_factors(graph, tree, f1):
         undo(graph, tree, v0)
         return tl.INFINITE
+    put_off = False  # of what is due a part is left for later steps
     while True:
         moving = tree.pending[: count_due(state)]
+        if moving.size > 0 and bounded:
+            moving = list_moving(moving, tree.node) if goes_on_with_it else choose_due(graph, tree, f1, scaled)
+            put_off = moving.size < state[tl.S_PENDING]
+            if moving.size == 0 and state[tl.S_ROUNDS] > 0:
+                break
+        goes_on_with_it = False
         if moving.size > 0:
             relinearize(graph, tree, moving)
         lap(began, tl.LINEARIZE, state)
@@ -97,16 +119,22 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW], state[tl.S_EDITED] = f1, v1, 0
         state[tl.S_ROUNDS] += 1
+        if is_torn_apart(state, totals):
+            weighted_error = follow_up(graph, tree, scaled)
         chi2 = totals[tl.T_CHI2]
         if state[tl.S_ROUNDS] > 1:
             totals[tl.T_GAINED] = max(totals[tl.T_GAINED], before - chi2)
         totals[tl.T_GAINED] = max(totals[tl.T_GAINED], totals[tl.T_BEFORE] - chi2)
+        if state[tl.S_BEHIND] != 0:  # χ² of what is torn says nothing
+            break
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
             break
         if state[tl.S_WAIT] != 0 or not goes_on(weighted_error, scaled, state, totals):
             break
-        if may_keep_factor(tree, scaled):
+        if put_off or not may_go_on(tree, scaled[tl.P_BUDGET]):
+            break
+        if may_keep_factor(tree, scaled) and fits_chord_step(tree, scaled[tl.P_BUDGET]):
             weighted_error = chord_step(least_error(scaled, state, totals), graph, tree, scaled)
             began = cycles()
             totals[tl.T_GAINED] = max(totals[tl.T_GAINED], chi2 - totals[tl.T_CHI2])
@@ -116,16 +144,21 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     changed = tree.changed[: state[tl.S_CHANGED]]
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
+    if put_off and is_in_vain(scaled[tl.P_BUDGET], state, totals):
+        state[tl.S_TRY_AT] = state[tl.S_STEP] + RETRY
     note_after(settings, state, totals)
     return tl.DONE
 
 
 @inline_kernel
-def note_before(v1: int, f1: int, state: I64, totals: F64) -> None:
+def note_before(v1: int, f1: int, bounded: bool, state: I64, totals: F64) -> None:
     """How things are when a step begins that is up to v1 variables and f1 factors."""
     totals[tl.T_LARGEST_DIAGONAL_BEFORE] = totals[tl.T_LARGEST_DIAGONAL]
     totals[tl.T_UNIT], totals[tl.T_BEFORE] = residual_unit(f1, totals), totals[tl.T_CHI2]
-    totals[tl.T_GAINED] = 0.0
+    totals[tl.T_GAINED] = totals[tl.T_WORK] = 0.0
+    state[tl.S_WAS_BEHIND], totals[tl.T_ERROR_BEFORE] = state[tl.S_BEHIND], totals[tl.T_ERROR]
+    if state[tl.S_BEHIND] == 0 and not (bounded and state[tl.S_AFTER] & (tl.WORSE + tl.ROSE) != 0):
+        totals[tl.T_WHOLE] = totals[tl.T_CHI2]
     state[tl.S_OLD], state[tl.S_RISES] = state[tl.S_FIRST_NEW], 0
     nothing_new = v1 == state[tl.S_FIRST_NEW] and f1 == state[tl.S_TAKEN] and state[tl.S_EDITED] == 0
     state[tl.S_CONTINUES] = 1 if nothing_new else 0

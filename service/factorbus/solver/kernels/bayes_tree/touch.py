@@ -1,5 +1,6 @@
 """What a step takes apart: the cliques that are touched, and what hangs from them.  MATH §9.3, §9.4."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +57,9 @@ def find_touched(graph: Graph, tree: Tree, new: NewRows, moving: I64, settings: 
     if reorders:
         renewed = renewed[:0]
         count = touch_around(moving, fac, node, link, clique, state, listed, count)
-    near = count_near(listed[:count], reorders, settings, clique, state)
+    # A step with a budget relinearizes a part of the map, which need not come near the root for that.
+    moves_root = reorders and not settings[tl.P_BUDGET] < math.inf
+    near = count_near(listed[:count], moves_root, settings, clique, state)
     if near > 0:
         count = touch_near(graph, tree, near, new.f1, settings, listed, count)
         renewed = still_renewed(renewed, clique, state)
