@@ -14,12 +14,14 @@ from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, move_variab
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.work import SOLVING, note_work, work_of_solving
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.prefetch import prefetch
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
 QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn with a smaller error is not counted
+LINE = 8  # numbers of a cache line
 LEAST_SHARE = 0.125  # of the budget, which back-substitution has whatever came before it
 SURROUNDINGS = 16  # levels of the tree below the root, which come before what is further down
 ALL_LEVELS = 1 << 62
@@ -65,7 +67,9 @@ def substitute(
                 if turn > 0 and c == ids[f]:
                     row[tl.C_MOVES] &= tl.MOVED
                 else:
+                    fetch_row(row[tl.C_CHILD], clique)
                     gather_separator(row, var, lists, delta, numbers)
+                    fetch_numbers(row[tl.C_CHILD], clique, lists, numbers)
                     if row[tl.C_PIVOTS] > shares.size:
                         shares = np.empty(2 * row[tl.C_PIVOTS])
                     solve_rows(row, numbers, shares)
@@ -124,6 +128,27 @@ def note_behind(ids: I64, clique: I64, state: I64) -> None:
 
 
 @inline_kernel
+def fetch_row(c: int, clique: I64) -> None:
+    """The row of clique c, if there is one, comes into the cache."""
+    if c >= 0:
+        for line in range(0, tl.C_WIDTH, LINE):
+            prefetch(clique, c * tl.C_WIDTH + line)
+
+
+@inline_kernel
+def fetch_numbers(c: int, clique: I64, lists: I64, numbers: F64) -> None:
+    """The same of what is first read of clique c: its variables, δ of its separator, rows of R."""
+    if c >= 0:
+        row = clique[c]
+        prefetch(lists, row[tl.C_LIST])
+        prefetch(numbers, row[tl.C_USED])
+        prefetch(numbers, row[tl.C_USED] + LINE)
+        prefetch(numbers, row[tl.C_ROWS])
+        prefetch(numbers, row[tl.C_ROWS] + row[tl.C_LD])
+        prefetch(numbers, row[tl.C_ROWS] + 2 * row[tl.C_LD])
+
+
+@inline_kernel
 def moves_along(graph: Graph, tree: Tree, c: int, far: float, delta: F64, weight: F64, motion: F64) -> bool:
     """Whether a clique and all below it only move as a whole; motion gets by how much."""
     clique = tree.clique
@@ -146,6 +171,7 @@ def next_clique(
     clique = tree.clique
     while True:
         while child >= 0:
+            fetch_row(clique[child, tl.C_NEXT], clique)
             if is_visited(graph, tree, child, far, delta, weight, motion):
                 return child
             child = clique[child, tl.C_NEXT]
