@@ -17,7 +17,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.wording import counted
 
 ACCEPTED, SUSPECT, REJECTED, RESTORED = "accepted", "suspect", "rejected", "restored"
-CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
+CLOSURE_STATES: tuple[str, ...] = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 BELIEVED = {ACCEPTED, RESTORED}
@@ -158,7 +158,7 @@ class ClosureLedger:
         self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
         self.of_factor: dict[int, Closure] = {}
         self.looks = self.moved_at = 0
-        self._counts = dict.fromkeys(CLOSURE_STATES, 0)
+        self._counts: dict[str, int] = dict.fromkeys(CLOSURE_STATES, 0)
 
     @property
     def closures(self) -> list[Closure]:
