@@ -46,8 +46,11 @@ def events_of(endpoint: str, name: str) -> tuple[zenoh.Session, "queue.SimpleQue
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
     session, came = zenoh.open(config), queue.SimpleQueue[dict[str, Any]]()
-    take = zenoh.handlers.Callback(lambda sample: came.put(msgpack.unpackb(sample.payload.to_bytes())), indirect=False)
-    session.declare_subscriber(keys.event_key(name), take)
+
+    def take(sample: Any) -> None:
+        came.put(msgpack.unpackb(sample.payload.to_bytes()))
+
+    session.declare_subscriber(keys.event_key(name), zenoh.handlers.Callback(take, indirect=False))
     return session, came
 
 

@@ -18,7 +18,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.wording import counted
 
 ACCEPTED, SUSPECT, REJECTED, RESTORED = "accepted", "suspect", "rejected", "restored"
-CLOSURE_STATES = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
+CLOSURE_STATES: tuple[str, ...] = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 BELIEVED = {ACCEPTED, RESTORED}
