@@ -50,7 +50,7 @@ def choose_due(graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
     first.  All of them, if they fit.
     """
     state = tree.state
-    if not may_try(state):
+    if not may_try(state) or state[tl.S_BEHIND] != 0:
         return tree.pending[:0].copy()
     moving = choose_among(list_considered(graph, tree, -1.0, settings), graph, tree, f1, settings)
     if moving.size == state[tl.S_PENDING]:
