@@ -176,20 +176,20 @@ def test_every_insert_is_accepted_with_a_budget_below_anything() -> None:
         report, theirs = solver.step(), free.step()
         assert (report.new_variables, report.new_factors) == (theirs.new_variables, theirs.new_factors)
         assert report.relinearized <= report.eliminated  # what is eliminated anyway
-        assert report.iterations <= 1
+        assert report.iterations <= 1 or report.strategy == "batch"
         heavy += theirs.iterations > 1
     assert heavy > 5
     assert left_alone(solver).chi2 == pytest.approx(left_alone(free).chi2, rel=1e-6)
 
 
 def test_a_step_takes_no_more_than_its_budget_where_nothing_far_is_joined() -> None:
-    """All but the loops themselves: these are eliminated whole, whatever they take."""
+    """All but the loops themselves, which are eliminated whole, and steps that Levenberg-Marquardt replaces."""
     budget, deferred = 5e7, 0
     solver = Solver(Options(step_budget=budget))
     for batch in WORLDS["streets"](7):
         solver.stage(batch)
         report = solver.step()
-        if report.new_factors <= report.new_variables:
+        if report.new_factors <= report.new_variables and report.strategy != "batch":
             assert report.work <= 1.25 * budget
         deferred += report.deferred_relinearizations > 0
     assert deferred > 5

@@ -161,11 +161,10 @@ class TreeSteps:
 
     @property
     def _is_tolerable(self) -> bool:
-        """Whether the tree's last step, which had a budget, may stand though χ² rose: it has none for
-        Levenberg-Marquardt on all of Λ, and those that follow, or one with nothing new, see to it.
-        """
-        chi2 = self._tree.totals.item(tl.T_CHI2)
-        return math.isfinite(chi2) and chi2 <= MOST_RISE * (self._tree.totals.item(tl.T_WHOLE) + LEAST_CHI2)
+        """Whether the tree's last step may stand though χ² rose: it left a part behind, so that χ² says little yet."""
+        totals = self._tree.totals
+        chi2, most = totals.item(tl.T_CHI2), MOST_RISE * (totals.item(tl.T_WHOLE) + LEAST_CHI2)
+        return self._tree.behind and math.isfinite(chi2) and chi2 <= most
 
     @property
     def _gained(self) -> float:

@@ -39,6 +39,7 @@ MOST_RISE = 10.0
 # Steps without a try after one that left more than this share of all errors, or that took less than this share of its
 # budget and found nothing to choose.
 RETRY, USEFUL, ROOMY = 8, 0.9, 0.5
+FEW = 5.0  # times what is allowed: where errors are more, every part counts
 # What becomes of a clique: it is not wanted; wanted; taken; taken with all that is wanted below it.
 UNWANTED, WANTED, TAKEN, WHOLE = 0, 1, 2, 3
 
@@ -49,7 +50,7 @@ def choose_due(graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
     first.  All of them, if they fit.
     """
     state = tree.state
-    if not may_try(state):
+    if not may_try(state) or state[tl.S_BEHIND] != 0:
         return tree.pending[:0].copy()
     moving = choose_among(list_considered(graph, tree, -1.0, settings), graph, tree, f1, settings)
     if moving.size == state[tl.S_PENDING]:
@@ -232,14 +233,16 @@ def fits_chord_step(tree: Tree, budget: float) -> bool:
 
 
 @inline_kernel
-def is_in_vain(budget: float, state: I64, totals: F64) -> bool:
+def is_in_vain(settings: F64, state: I64, totals: F64) -> bool:
     """Whether a part of what was due already was relinearized, and all errors are hardly less than before: where one
     part meets the next both have errors; or there was room for it, and nothing to choose.
     """
     if state[tl.S_RELINEARIZED] > 0:
         was = totals[tl.T_ERROR_BEFORE]
-        return state[tl.S_BEHIND] == 0 and was > totals[tl.T_ALLOWED] and totals[tl.T_ERROR] > USEFUL * was
-    return state[tl.S_WAS_BEHIND] == 0 and may_try(state) and totals[tl.T_WORK] < ROOMY * budget
+        few = FEW * settings[tl.P_CONVERGED] * (totals[tl.T_CHI2] + LEAST_CHI2)
+        hardly_less = few > was > totals[tl.T_ALLOWED] and totals[tl.T_ERROR] > USEFUL * was
+        return state[tl.S_BEHIND] == 0 and hardly_less
+    return state[tl.S_WAS_BEHIND] == 0 and may_try(state) and totals[tl.T_WORK] < ROOMY * settings[tl.P_BUDGET]
 
 
 @inline_kernel

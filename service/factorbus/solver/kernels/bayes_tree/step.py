@@ -144,7 +144,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     changed = tree.changed[: state[tl.S_CHANGED]]
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
-    if put_off and is_in_vain(scaled[tl.P_BUDGET], state, totals):
+    if put_off and is_in_vain(scaled, state, totals):
         state[tl.S_TRY_AT] = state[tl.S_STEP] + RETRY
     note_after(settings, state, totals)
     return tl.DONE
