@@ -1,5 +1,6 @@
 """Steps with a budget: what does not fit is left for later ones, and the map still comes to its optimum.  MATH §9.10"""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -269,6 +270,12 @@ def unheld(loose: Batch, n: int) -> Batch:
 def test_a_budget_is_a_finite_number(budget: object) -> None:
     with pytest.raises(errors.BadOption, match="step_budget"):
         Options(step_budget=budget)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("budget", [-1.0, math.nan])
+def test_the_budget_of_one_step_is_no_less_than_nothing(budget: float) -> None:
+    with pytest.raises(errors.BadOption, match="budget"):
+        Solver().step(budget=budget)
 
 
 @pytest.mark.parametrize("budget", [1e5, 3e6])

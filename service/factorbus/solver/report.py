@@ -31,10 +31,9 @@ class StepReport(NamedTuple):
                  tolerance
     phases_ms    milliseconds by phase;  step_ms: the whole step;  compiled_ms: the part of it within one compiled call,
                  where that does the work (mode "bayes-tree"), else None
-    deferred_relinearizations   variables that are due to be relinearized in a later step (mode "bayes-tree")
-    unsolved     what χ² may be above the optimum of this map: what `converged` goes by, and what a step with a budget
-                 left where it was (mode "bayes-tree")
-    work, budget what the step took and what it might take, in the units of `Options.step_budget`; 0: it had no bound
+    deferred_relinearizations, unsolved   of a step with a budget, else 0: variables that are due to be relinearized in
+                 a later step; what χ² may be above the optimum: what `converged` goes by, and what was left behind
+    work, budget what it took and what it might take, in the units of `Options.step_budget`; 0: it had no bound
     """
 
     mode: str

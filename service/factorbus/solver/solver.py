@@ -11,6 +11,7 @@ from factorbus.solver.changes.convert_to_points import find_convertible
 from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.source import CovarianceSource
+from factorbus.solver.errors import BadOption
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.columns import Columns
@@ -75,10 +76,14 @@ class Solver:
 
         budget: in the place of `Options.step_budget`, for this step.
 
-        Raises Underconstrained or NotFinite; what was staged since the last step is taken back then, and the solver is
-        as it was after that step, bit for bit.
+        Raises BadOption; or Underconstrained or NotFinite, and what was staged since the last step is taken back then,
+        and the solver is as it was after that step, bit for bit.
         """
-        return self._stepper.step(settle, self._options.step_budget if budget is None else budget)
+        if budget is None:
+            budget = self._options.step_budget
+        elif not budget >= 0.0:
+            raise BadOption("budget", repr(budget), "0 or more, 0: without bound")
+        return self._stepper.step(settle, budget)
 
     def estimate(self) -> list[Group]:
         """A copy of all values: per kind, in insertion order, fixed variables in groups of their own.

@@ -25,6 +25,7 @@ from factorbus.solver.kernels.model.retract import differing
 from factorbus.solver.optimize.gauss_newton import Minimization, minimize
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.optimize.system import System
+from factorbus.solver.option_ranges import MOST_BUDGET
 from factorbus.solver.options import Options
 from factorbus.solver.report import PhaseShares, StepReport, Stopwatch
 from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
@@ -46,6 +47,7 @@ _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimat
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
 _STALLS = "a step with nothing new did not lower χ²: Levenberg-Marquardt to the optimum"
+_NO_BUDGET = (0, 0.0, 0.0, 0.0)
 _new = tuple.__new__
 
 
@@ -78,7 +80,9 @@ class TreeSteps:
         clock = self._options.clock
         started = clock() if clock else 0.0
         tree, because = self._tree, ""
-        tree.set_budget(0.0 if settle else budget)
+        bounded = not settle and 0.0 < budget <= MOST_BUDGET
+        if bounded:
+            tree.set_budget(budget)
         try:
             status = tree.step()
             if status == tl.UNSURE:
@@ -92,7 +96,9 @@ class TreeSteps:
             self._graph.forget(self._mark)
             raise
         finally:
-            bounded = tree.set_budget(0.0) and not tree.state.item(tl.S_CONTINUES)
+            if bounded:
+                tree.set_budget(math.inf)
+        bounded = bounded and not tree.state.item(tl.S_CONTINUES)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
         if not settle and ((bounded and self._is_tolerable) or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
@@ -298,8 +304,7 @@ class TreeSteps:
         reported = self._tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        totals = self._tree.totals.tolist()
-        model, chi2, _, error, allowed, chi2_before = totals[: tl.T_BEFORE + 1]
+        _, chi2, _, error, allowed, chi2_before = self._tree.totals[: tl.T_BEFORE + 1].tolist()
         chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
         behind = self._tree.behind
         share = self._options.converged_share
@@ -329,13 +334,16 @@ class TreeSteps:
             PhaseShares(tl.PHASES, reported[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
-            self._tree.deferred,
-            0.0 if result and result.converged else min(
-                error + (max(chi2 - model, 0.0) if behind else 0.0), chi2 - totals[tl.T_LEAST]
-            ),
-            totals[tl.T_WORK],
-            budget,
+            *(self._left(result, budget) if budget else _NO_BUDGET),
         ))  # fmt: skip
+
+    def _left(self, result: Minimization | None, budget: float) -> tuple[int, float, float, float]:
+        """What a step with a budget has left to do, and what it took of it: the last fields of a report."""
+        totals = self._tree.totals
+        model, chi2, error, least = (totals.item(k) for k in (tl.T_MODEL, tl.T_CHI2, tl.T_ERROR, tl.T_LEAST))
+        more = max(chi2 - model, 0.0) if self._tree.behind else 0.0
+        unsolved = 0.0 if result and result.converged else min(error + more, max(chi2, 0.0) - least)
+        return self._tree.deferred, unsolved, totals.item(tl.T_WORK), budget
 
 
 def _because(count: int, rounds: int, chords: int) -> str:

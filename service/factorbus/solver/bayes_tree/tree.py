@@ -23,7 +23,6 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.task_queue import NOBODY
-from factorbus.solver.option_ranges import MOST_BUDGET
 from factorbus.solver.options import Options
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 
@@ -50,13 +49,11 @@ class CliqueTree(Arenas):
         finally:
             self.settings[tl.P_INITIALIZE] = place
 
-    def set_budget(self, budget: float) -> bool:
+    def set_budget(self, budget: float) -> None:
         """What the steps that follow may take, in units of work (`kernels/bayes_tree/work.py`), before they defer the
-        rest; 0: without bound.  Gives whether those before had one.
+        rest; math.inf: they have no bound.
         """
-        was = self.settings.item(tl.P_BUDGET)
-        self.settings[tl.P_BUDGET] = budget if 0.0 < budget <= MOST_BUDGET else math.inf
-        return was < math.inf
+        self.settings[tl.P_BUDGET] = budget
 
     def clear(self) -> None:
         """Let go of everything: the next step takes in the whole graph."""
