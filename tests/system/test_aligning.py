@@ -65,7 +65,7 @@ def test_two_maps_become_one(endpoint: str) -> None:
 
 def test_copies_of_a_candidate_are_no_further_candidates(endpoint: str) -> None:
     one, other, candidates = drives(3, 6, 4, 0)
-    with connect(endpoint, client="merger", timeout_s=60) as bus, bus.map("hall-c") as hall, bus.map("yard-c") as yard:
+    with connect(endpoint, client="merger", timeout_s=60) as bus, bus.map("hall-d") as hall, bus.map("yard-d") as yard:
         fill(hall, one)
         fill(yard, other)
         found = align(hall, yard, drafted(candidates), letters=LETTERS)

@@ -10,7 +10,7 @@
 
 /* What is in a bin, by the name of its field: §4, §10 and §15 to §17 of the contract; f64 where not said. */
 static const char *const INTEGERS[] = {"keys", "others", "dims", "other_dims", "landmarks", "observations", "candidates",
-                                       "factors", "ids", "stamps", NULL};
+                                       "factors", "ids", "stamps", "tried", NULL};
 static const char *const BYTES[] = {"plausible", "matched", NULL};
 static const char *const MESSAGES[] = {"payload", "ask", "shard", NULL};
 

@@ -123,7 +123,8 @@ class _Reading:
             except Exception as fault:  # whatever the bytes lead to
                 found = f"{counted(len(message.data), 'byte')} that cannot be read ({fault})"
                 raise BadRosMessage(topic, found, f"a {message.type_name}") from None
-            if message.type_name != (wanted := self._inputs.get(topic, TRANSFORMS)):
+            wanted = self._inputs.get(topic, TRANSFORMS)
+            if FORMER_NAMES.get(message.type_name, message.type_name) != wanted:
                 raise BadRosMessage(topic, f"a {message.type_name}", f"a {wanted}")
             if topic in self._statics:
                 self._front_end.static(topic, read)

@@ -67,7 +67,7 @@ function explainSuspect({ id, kind, keys, state, reason, distance, chance, since
   const said = {
     "poses": keys.join(", "), state, reason,
     "d²": distance === null ? "not looked at yet" : short(distance, 4),
-    "chance": chance === null ? "not looked at yet" : `${short(100 * chance, 2)} % of false ones would be as near`,
+    "chance": chance === null ? "not looked at yet" : `odds of ${short(chance, 2)} that it is false`,
     "since": `revision ${since}`,
   };
   of("panel").replaceChildren(
