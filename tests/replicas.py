@@ -26,7 +26,7 @@ class Link:
     def cut(self, seconds: float, noticed: bool) -> None:
         """Nothing passes for so long; then it does again, over a new connection where the cut is `noticed`."""
         self.relay.hold()
-        time.sleep(seconds)  # what it is about
+        time.sleep(seconds)  # the length of the cut is what a test asks for
         if noticed:
             self.relay.break_all()
         self.relay.release()
@@ -36,7 +36,7 @@ class Link:
         chance = random.Random(5)
         for n in range(cuts):
             self.cut(chance.uniform(*seconds), noticed=bool(n % 2))
-            time.sleep(seconds[0])
+            time.sleep(seconds[0])  # the link is whole for as long: what the drive is about
 
 
 def replica_settings(link: Link, *more: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Maps that a service is told to have are made where clients' are, which may ask for the same ones meanwhile."""
+"""Maps named at the start of a service are made where clients' are, which may ask for the same ones meanwhile."""
 
 import threading
 from typing import Any

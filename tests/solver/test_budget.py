@@ -109,7 +109,7 @@ def test_the_far_part_stays_behind_and_follows() -> None:
         assert report.unsolved > 0.0
         flagged = {c for c in cliques(solver) if tree.clique[c, tl.C_MOVES] & tl.BEHIND}
         assert flagged
-        for c in flagged:  # whoever comes down from the root finds it
+        for c in flagged:  # a walk down from the root finds it
             above = int(tree.clique[c, tl.C_PARENT])
             assert above < 0 or above in flagged
     assert left > 20

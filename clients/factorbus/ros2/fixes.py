@@ -51,7 +51,7 @@ class Antenna:
     """Where an antenna was at a fix: in the frame of its keyframe, and in the map by odometry alone.
 
     variance: what odometry since the keyframe adds in any direction, m².  unplaced: says that nothing tells where its
-    frame is on the robot, in whose middle it is then; empty: it is told.
+    frame is on the robot, in whose middle it is then; empty: its place is known.
     """
 
     key: int
