@@ -17,6 +17,7 @@ CAMERA = (0.3, 0.0, math.pi / 2)
 SCALE, CURVATURE = 1.03, 0.02
 REACH_M = 5.0
 KEYFRAMES = 1 + 4 * (STEPS + 1)
+TOKENS = 1 + 4 + 4 + 6  # its node, publishers, subscriptions and services
 
 
 def main() -> None:
@@ -30,7 +31,7 @@ def main() -> None:
         print("ready", flush=True)
         sys.stdin.readline()
         node.wait_for_endpoints(8)
-        print("done", json.dumps(drive(node) | {"tokens": node.tokens()}), flush=True)
+        print("done", json.dumps(drive(node) | {"tokens": node.tokens(TOKENS)}), flush=True)
 
 
 def drive(node: ros.RosNode) -> dict[str, object]:

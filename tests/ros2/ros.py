@@ -5,6 +5,7 @@ import json
 import math
 import queue
 import time
+from collections.abc import Callable
 from typing import Any
 
 import words
@@ -84,33 +85,39 @@ class RosNode:
         answer = words.TriggerResponse.deserialize(sample.payload.to_bytes())
         return answer.success, answer.message, read_attachment(sample.attachment.to_bytes())
 
-    def tokens(self) -> list[str]:
-        """Who is there, as `ros2 topic list` finds out; where no token comes in time, it is asked again."""
-        for _ in range(6):
-            replies = self._bus.liveliness().get(f"@ros2_lv/{self._domain}/**", timeout=5)
-            if tokens := sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None):
-                return tokens
-        return []
+    def tokens(self, count: int) -> list[str]:
+        """Who is there, as `ros2 topic list` finds out, once a number of tokens are seen."""
+        return sorted(self._watch(lambda seen: len(seen) >= count))
 
-    def wait_for_endpoints(self, count: int, timeout_s: float = 30.0) -> list[str]:
+    def wait_for_endpoints(self, count: int) -> list[str]:
         """The tokens of nodes, publishers and subscriptions, once a node and a number of others are seen.
 
         A token comes after what it stands for; in what order they come is not said.
         """
-        seen: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+        def enough(seen: list[str]) -> bool:
+            kinds = [token.split("/")[5] for token in seen]
+            return kinds.count("MP") + kinds.count("MS") >= count and "NN" in kinds
+
+        return self._watch(enough)
+
+    def _watch(self, enough: Callable[[list[str]], bool], timeout_s: float = 60.0) -> list[str]:
+        """The tokens there are and those that come, each once; a single question may come before a router knows."""
+        came: queue.SimpleQueue[str] = queue.SimpleQueue()
 
         def see(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                seen.put(str(sample.key_expr))
+                came.put(str(sample.key_expr))
 
         key = f"@ros2_lv/{self._domain}/**"
         watching = self._bus.liveliness().declare_subscriber(key, Callback(see, indirect=False), history=True)
-        tokens, kinds = list[str](), list[str]()
-        while kinds.count("MP") + kinds.count("MS") < count or "NN" not in kinds:
-            tokens.append(seen.get(timeout=timeout_s))
-            kinds.append(tokens[-1].split("/")[5])
+        seen: list[str] = []
+        while not enough(seen):
+            token = came.get(timeout=timeout_s)
+            if token not in seen:
+                seen.append(token)
         watching.undeclare()
-        return tokens
+        return seen
 
     def wait_for(self, topic: str, timeout_s: float = 30.0) -> tuple[Any, Any]:
         """The next message on a topic; others are passed over."""

@@ -16,7 +16,7 @@ import zenoh
 from false_closures import DriveWithFalse, drive_with_false
 from journalled import Services, Stream
 from processes import PATIENCE_S
-from replicas import Link, replica_settings, upstream_row
+from replicas import Link, replica_settings, upstream_row, wait_until_level
 
 from factorbus.client import Changes, Draft, Map, Refused, connect
 from factorbus.journal.store import open_store
@@ -187,8 +187,9 @@ def test_a_replica_has_the_verdicts_of_upstream_and_upstream_those_of_the_replic
         out = at_base.suspects().factors.tolist()
         at_base.change(Changes().accept(out[0]))
         at_base.wait_converged(PATIENCE_S)
-        robot.eventually(lambda: told(driven), lambda seen: seen == told(at_base))
-        robot.eventually(lambda: values(driven), lambda seen: seen == values(at_base))
+        wait_until_level(driven, at_base, POSES)
+        assert told(driven) == told(at_base)
+        assert values(driven) == values(at_base)
         assert told(driven)[out[0]] == ("restored", "user")
     robot.end(signal.SIGTERM)
     base.end(signal.SIGTERM)
