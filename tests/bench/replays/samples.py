@@ -31,6 +31,8 @@ def sample_steps(steps: int, most: int = 100) -> tuple[int, ...]:
     """
     if steps <= most:
         return tuple(range(steps))
+    if most == 1:
+        return (steps - 1,)
     width = (steps - 1) / (most - 1)
     picked = {int(width * (i + (i * _GOLDEN) % 1.0)) for i in range(most - 1)}
     return (*sorted(step for step in picked if step < steps - 1), steps - 1)

@@ -308,6 +308,7 @@ class TreeSteps:
         chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
         behind = self._tree.behind
         share = self._options.converged_share
+        error += self._tree.totals.item(tl.T_EXCESS)
         converged = result.converged if result else error <= allowed and not behind
         if not result and self._tree.raised:
             converged &= self._is_within(share, chi2)
@@ -342,6 +343,7 @@ class TreeSteps:
         totals = self._tree.totals
         model, chi2, error, least = (totals.item(k) for k in (tl.T_MODEL, tl.T_CHI2, tl.T_ERROR, tl.T_LEAST))
         more = max(chi2 - model, 0.0) if self._tree.behind else 0.0
+        error += totals.item(tl.T_EXCESS)
         unsolved = 0.0 if result and result.converged else min(error + more, max(chi2, 0.0) - least)
         return self._tree.deferred, unsolved, totals.item(tl.T_WORK), budget
 

@@ -4,11 +4,13 @@ import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.chord_step import error_left
+from factorbus.solver.kernels.bayes_tree.decrement import decrement
 from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_errors
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
-from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
 MOST_ROUNDS = 10  # of a step that has not converged
@@ -17,6 +19,8 @@ LARGE_GAIN = 0.05  # of χ², in one round or all,
 AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
 MOST_LEFT = 0.5  # of the Σ error² that is allowed: what a chord step may leave, as it counts as a round
 SLOW = 0.1  # times as much error² is allowed after a step that had not converged
+UNCHECKED = 0.2  # of the Σ error² that is allowed: with more, and as much changed, the decrement is computed,
+ABSOLUTE = 0.02  # where factors of one variable have more than this share of it
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -29,7 +33,7 @@ def goes_on(weighted_error: float, settings: F64, state: I64, totals: F64) -> bo
     rounds, goes_on_slowly = state[tl.S_ROUNDS], state[tl.S_CONTINUES] != 0 or state[tl.S_SLOW] != 0
     if state[tl.S_ONCE] != 0:
         return False
-    if totals[tl.T_ERROR] > allowed(settings, state, totals):
+    if left(totals) > allowed(settings, state, totals):
         return rounds < (settings[tl.P_MAX_ROUNDS] if goes_on_slowly else MOST_ROUNDS)
     return (
         state[tl.S_CONTINUES] == 0
@@ -39,10 +43,42 @@ def goes_on(weighted_error: float, settings: F64, state: I64, totals: F64) -> bo
 
 
 @inline_kernel
+def left(totals: F64) -> float:
+    """What a Gauss-Newton step may take off χ², by what is known: Σ error², or the decrement where that is more."""
+    return totals[tl.T_ERROR] + totals[tl.T_EXCESS]
+
+
+@part
+def check_decrement(graph: Graph, tree: Tree, settings: F64) -> None:
+    """Compute the decrement where Σ error² is as small as is allowed, but not by far, has changed by as much, and
+    factors that say where in the world a variable is have a part in it.
+    """
+    state, totals = tree.state, tree.totals
+    error, share = totals[tl.T_ERROR], settings[tl.P_CONVERGED] * (totals[tl.T_CHI2] + LEAST_CHI2)
+    if state[tl.S_CONTINUES] != 0 or error <= UNCHECKED * share or error > allowed(settings, state, totals):
+        totals[tl.T_EXCESS] = 0.0
+    elif totals[tl.T_UNCHECKED] > max(UNCHECKED * share, totals[tl.T_CHECKED]):
+        totals[tl.T_UNCHECKED], totals[tl.T_CHECKED], totals[tl.T_EXCESS] = 0.0, error, 0.0
+        if state[tl.S_EXACT] != 0 and error_of_absolute(graph, tree) > ABSOLUTE * share:
+            found = decrement(least_error(settings, state, totals), share, graph, tree)
+            totals[tl.T_EXCESS] = found - error if found > share else 0.0
+
+
+@inline_kernel
+def error_of_absolute(graph: Graph, tree: Tree) -> float:
+    """Σ error² of the factors of one variable: their Jacobians turn alike where a map turns as a whole."""
+    total = 0.0
+    for f in range(tree.state[tl.S_FACTORS]):
+        if graph.fac[f, at.F_J] < 0:
+            total += tree.factor_errors[f, tl.E_ERROR]
+    return total
+
+
+@inline_kernel
 def mark_unconverged(graph: Graph, tree: Tree, settings: F64) -> None:
     """Where Σ error² is more than is allowed, all variables that have a part in it are relinearized next."""
     state, totals = tree.state, tree.totals
-    if totals[tl.T_ERROR] > allowed(settings, state, totals):
+    if left(totals) > allowed(settings, state, totals):
         note_work(SCANNING * state[tl.S_FACTORS], totals)
         mark_large_errors(least_error(settings, state, totals), graph, tree)
         state[tl.S_DUE] = 1
@@ -60,6 +96,7 @@ def may_keep_factor(tree: Tree, settings: F64) -> bool:
     state, totals = tree.state, tree.totals
     return (
         state[tl.S_CHORDS] == 0
+        and totals[tl.T_EXCESS] == 0.0
         and state[tl.S_CONTINUES] == 0
         and state[tl.S_RAISED] == 0
         and error_left(tree) <= MOST_LEFT * allowed(settings, state, totals)
@@ -92,7 +129,7 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
     totals[tl.T_ALLOWED] = converged_error(settings, state, totals)
     # What a budget has put off says nothing of how fast the others converge.
     put_off = state[tl.S_PENDING] != 0 and state[tl.S_CONTINUES] == 0 and settings[tl.P_BUDGET] < math.inf
-    unconverged = totals[tl.T_ERROR] > totals[tl.T_ALLOWED]
+    unconverged = left(totals) > totals[tl.T_ALLOWED]
     state[tl.S_SLOW] = 1 if unconverged and not put_off else 0
     if unconverged and put_off:
         state[tl.S_DUE] = 1
@@ -104,4 +141,4 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
     if state[tl.S_RAISED] != 0:
         state[tl.S_AFTER] += tl.RAISED
     if state[tl.S_AFTER] == 0:
-        totals[tl.T_LEAST] = max(chi2 - totals[tl.T_ERROR], 0.0)
+        totals[tl.T_LEAST] = max(chi2 - left(totals), 0.0)

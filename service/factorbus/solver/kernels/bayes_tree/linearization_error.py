@@ -86,6 +86,7 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
     state, totals = tree.state, tree.totals
     delta, most = scalars[0], 0.0
     chi2, sizes, full, counted = totals[tl.T_CHI2], totals[tl.T_ADDED_UP], totals[tl.T_ERROR], totals[tl.T_COUNTED]
+    unchecked = totals[tl.T_UNCHECKED]
     if state[tl.S_MOVED] * MUCH > state[tl.S_VARIABLES]:
         last, c, s = -1, 1.0, 0.0
         for f in range(state[tl.S_FACTORS]):
@@ -98,6 +99,7 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
                 error, more, size, more_full, more_counted = evaluate_factor(graph, tree, f, v, c, s, how, threshold)
                 most, chi2, sizes = max(most, error), chi2 + more, sizes + size
                 full, counted = full + more_full, counted + more_counted
+                unchecked += abs(more_full)
     else:
         put_in_order(moved[: state[tl.S_MOVED]], state[tl.S_VARIABLES])
         for k in range(state[tl.S_MOVED]):
@@ -116,9 +118,11 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
                     )
                     most, chi2, sizes = max(most, error), chi2 + more, sizes + size
                     full, counted = full + more_full, counted + more_counted
+                    unchecked += abs(more_full)
                 slot = next_incidence(slot, link)
     totals[tl.T_CHI2], totals[tl.T_ADDED_UP] = chi2, sizes
     totals[tl.T_ERROR], totals[tl.T_COUNTED] = max(full, 0.0), max(counted, 0.0)
+    totals[tl.T_UNCHECKED] = unchecked
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = STAYED
     state[tl.S_MOVED] = 0

@@ -32,7 +32,7 @@ class Tree(NamedTuple):
     motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
     saved   (2 k, SAVED) float64 what the k factors of a step under way change of their variables, for when it fails
     state   int64            counters and the heads of free lists
-    totals  (18,) float64    χ² and sums of errors over all factors, and bounds that follow from them
+    totals  (21,) float64    χ² and sums of errors over all factors, and bounds that follow from them
     """
 
     settings: Floats

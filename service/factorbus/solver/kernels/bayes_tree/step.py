@@ -25,6 +25,7 @@ from factorbus.solver.kernels.bayes_tree.begin_step import begin_step
 from factorbus.solver.kernels.bayes_tree.changed_variables import count_differing
 from factorbus.solver.kernels.bayes_tree.chord_step import chord_step
 from factorbus.solver.kernels.bayes_tree.convergence import (
+    check_decrement,
     goes_on,
     least_error,
     mark_unconverged,
@@ -130,6 +131,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
             break
+        check_decrement(graph, tree, scaled)
         if state[tl.S_WAIT] != 0 or not goes_on(weighted_error, scaled, state, totals):
             break
         if put_off or not may_go_on(tree, scaled[tl.P_BUDGET]):
@@ -138,6 +140,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
             weighted_error = chord_step(least_error(scaled, state, totals), graph, tree, scaled)
             began = cycles()
             totals[tl.T_GAINED] = max(totals[tl.T_GAINED], chi2 - totals[tl.T_CHI2])
+            check_decrement(graph, tree, scaled)
             if totals[tl.T_CHI2] <= chi2 and not goes_on(weighted_error, scaled, state, totals):
                 break
         mark_unconverged(graph, tree, scaled)

@@ -1,0 +1,219 @@
+"""What the next Gauss-Newton step would take off χ²: the gradient at the estimate, by R.  MATH (9.39), (9.40)
+
+Σ error² adds up what each factor misses by itself.  Where the Jacobians of many factors have turned alike, their forces
+add up along directions that the map hardly holds, and the step takes off more than that sum.  So where the sum is not
+far below what is allowed, the forces are added up by variable first:
+
+1  gradient    of the factors with a part in Σ error²: at the estimate, less that of their linear models
+2  forward     d = R⁻ᵀ g in the cliques of their variables and those above, children first: |d|² is the decrement
+3  back        p = R⁻¹ d where that is too much, parents first: R may be old, and what χ² loses along p is less then
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
+from factorbus.solver.kernels.bayes_tree.hessian_room import kept_samples, last_of_hessian
+from factorbus.solver.kernels.bayes_tree.records import Tree
+from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
+from factorbus.solver.kernels.bayes_tree.work import RELINEARIZING, SCANNING, note_work, work_of_solving
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many, row_of_pair
+from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
+from factorbus.solver.kernels.model.many import linearize_kept
+from factorbus.solver.kernels.model.records import Graph
+from factorbus.solver.kernels.model.sizes import information_at, residual_dim
+
+
+@part
+def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
+    """|R⁻ᵀ g|² with g the gradient that the linear models of all factors with error² of more than `least` miss; where
+    that is more than `most`, what χ² loses by the best step along R⁻¹ R⁻ᵀ g, by the Jacobians at the estimate.
+    """
+    var, fac, node, clique, state = graph.var, graph.fac, tree.node, tree.clique, tree.state
+    g = np.zeros(graph.counts[at.SCALARS])
+    scratch, end, taken = make_scratch(), tree.marked.size, 0
+    state[tl.S_STAMP] += 1
+    # 1
+    for f in range(state[tl.S_FACTORS]):
+        if tree.factor_errors[f, tl.E_ERROR] > least and not is_member(f, fac):
+            taken += 1
+            add_difference(graph, tree, f, scratch, tree.scalars[0], True, g)
+            for n in range(count_ends(f, fac)):
+                v = end_of(f, n, fac)
+                if var[v, at.V_SCALAR] >= 0:
+                    end = mark_above(v, node, clique, state, tree.marked, end)
+    cliques, work = tree.marked[end:], 0.0
+    for k in range(cliques.size):
+        work += work_of_solving(clique[cliques[k]])
+    note_work(SCANNING * state[tl.S_FACTORS] + RELINEARIZING * taken + work, tree.totals)
+    # 2
+    square = forward(graph, tree, cliques, g)
+    if square <= most:
+        return square
+    # 3
+    back(graph, tree, cliques, g)
+    more, curvature = np.zeros(g.size), square
+    for f in range(state[tl.S_FACTORS]):
+        if tree.factor_errors[f, tl.E_ERROR] > least and not is_member(f, fac):
+            add_difference(graph, tree, f, scratch, g, False, more)
+    for s in range(g.size):
+        curvature += g[s] * more[s]
+    note_work(SCANNING * state[tl.S_FACTORS] + RELINEARIZING * taken + work, tree.totals)
+    return square * min(square / curvature, 1.0) if curvature > 0.0 else square
+
+
+@part
+def add_difference(graph: Graph, tree: Tree, f: int, scratch: Scratch, x: F64, gradient: bool, out: F64) -> None:
+    """out += J'ᵀ Ω r' − (H δ − η) of factor f with x = δ, its gradient at the estimate less that of its linear model;
+    or out += J'ᵀ Ω J' x − H x.
+    """
+    if is_one_of_many(f, graph.fac):
+        add_difference_of_many(graph, tree, f, x, gradient, out)
+        return
+    var, fac, payload, r = graph.var, graph.fac, graph.payload, scratch.r
+    kind, e = fac[f, at.F_KIND], scratch.W[0]
+    dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
+    evaluate_apart(f, var, fac, graph.values, payload, r, scratch.H[0], scratch.H[1])
+    for a in range(dim if not gradient else 0):
+        r[a] = 0.0
+        for n in range(count_ends(f, fac)):
+            s = var[end_of(f, n, fac), at.V_SCALAR]
+            for c in range(dim_of_variable(var, end_of(f, n, fac)) if s >= 0 else 0):
+                r[a] += scratch.H[n, a, c] * x[s + c]
+    for a in range(dim):
+        e[a] = 0.0
+    for a in range(dim):
+        e[a] += payload[p] * r[a]
+        p += 1
+        for b in range(a + 1, dim):
+            e[a] += payload[p] * r[b]
+            e[b] += payload[p] * r[a]
+            p += 1
+    for n in range(count_ends(f, fac)):
+        s = var[end_of(f, n, fac), at.V_SCALAR]
+        for c in range(dim_of_variable(var, end_of(f, n, fac)) if s >= 0 else 0):
+            for a in range(dim):
+                out[s + c] += scratch.H[n, a, c] * e[a]
+    subtract_model(graph, tree, f, x, gradient, out)
+
+
+@part
+def add_difference_of_many(graph: Graph, tree: Tree, f: int, x: F64, gradient: bool, out: F64) -> None:
+    """The same of a factor that `many` evaluates."""
+    var, fac = graph.var, graph.fac
+    _, now = linearize_kept(f, var, fac, graph.values, graph.payload, kept_samples(f, var, fac, tree))
+    ends = count_ends(f, fac)
+    for a in range(len(now.J)):
+        e = now.r[a]
+        if not gradient:
+            e = 0.0
+            for n in range(ends):
+                s = var[end_of(f, n, fac), at.V_SCALAR]
+                for c in range(now.start[n], now.start[n + 1] if s >= 0 else now.start[n]):
+                    e += now.J[a, c] * x[s + c - now.start[n]]
+        for n in range(ends):
+            s = var[end_of(f, n, fac), at.V_SCALAR]
+            for c in range(now.start[n], now.start[n + 1] if s >= 0 else now.start[n]):
+                out[s + c - now.start[n]] += now.J[a, c] * e
+    for n in range(max(ends - 1, 1)):
+        for m in range(n + 1, max(ends, 2)):
+            subtract_model(graph, tree, row_of_pair(f, n, m, ends), x, gradient, out)
+
+
+@part
+def subtract_model(graph: Graph, tree: Tree, row: int, x: F64, gradient: bool, out: F64) -> None:
+    """out −= H x of the Hessian of a row, or H x − η."""
+    var, fac, hessian = graph.var, graph.fac, tree.hessian
+    i, j = fac[row, at.F_I], fac[row, at.F_J]
+    di = dim_of_variable(var, i)
+    dj = dim_of_variable(var, j) if j >= 0 else 0
+    s, t = var[i, at.V_SCALAR], var[j, at.V_SCALAR] if j >= 0 else -1
+    h, eta = tree.link[row, tl.L_AT], last_of_hessian(row, var, fac, tree.link) - di - dj
+    across, second, sign = h + di * di, h + di * di + di * dj, 1.0 if gradient else 0.0
+    for a in range(di if s >= 0 else 0):
+        total = -sign * load(hessian, eta + a)
+        for b in range(di):
+            total += load(hessian, h + a * di + b) * x[s + b]
+        for b in range(dj if t >= 0 else 0):
+            total += load(hessian, across + a * dj + b) * x[t + b]
+        out[s + a] -= total
+    for b in range(dj if t >= 0 else 0):
+        total = -sign * load(hessian, eta + di + b)
+        for a in range(di if s >= 0 else 0):
+            total += load(hessian, across + a * dj + b) * x[s + a]
+        for a in range(dj):
+            total += load(hessian, second + b * dj + a) * x[t + a]
+        out[t + b] -= total
+
+
+@part
+def forward(graph: Graph, tree: Tree, cliques: I64, g: F64) -> float:
+    """d = R⁻ᵀ g over `cliques`, children first, in the place of g; gives |d|²."""
+    clique, numbers, square = tree.clique, tree.numbers, 0.0
+    eta = np.empty(widest_of(cliques, clique))
+    for k in range(cliques.size):
+        row = clique[cliques[k]]
+        gather(row, graph.var, tree.lists, g, eta)
+        p, width, ld = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS], row[tl.C_LD]
+        for i in range(p):
+            line = row[tl.C_ROWS] + i * ld
+            d = eta[i] / load(numbers, line + i)
+            square += d * d
+            put(eta, i, d)
+            for c in range(i + 1, width):
+                put(eta, c, load(eta, c) - load(numbers, line + c) * d)
+        scatter(row, graph.var, tree.lists, eta, g)
+    return square
+
+
+@part
+def back(graph: Graph, tree: Tree, cliques: I64, d: F64) -> None:
+    """p = R⁻¹ d over `cliques`, which come children first, in the place of d."""
+    clique, numbers = tree.clique, tree.numbers
+    x = np.empty(widest_of(cliques, clique))
+    for k in range(cliques.size - 1, -1, -1):
+        row = clique[cliques[k]]
+        gather(row, graph.var, tree.lists, d, x)
+        p, width, ld = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS], row[tl.C_LD]
+        for i in range(p - 1, -1, -1):
+            line = row[tl.C_ROWS] + i * ld
+            total = x[i]
+            for c in range(i + 1, width):
+                total -= load(numbers, line + c) * load(x, c)
+            put(x, i, total / load(numbers, line + i))
+        scatter(row, graph.var, tree.lists, x, d)
+
+
+@inline_kernel
+def widest_of(cliques: I64, clique: I64) -> int:
+    """The most scalars that one of these cliques has."""
+    widest = 0
+    for k in range(cliques.size):
+        widest = max(widest, clique[cliques[k], tl.C_PIVOTS] + clique[cliques[k], tl.C_SEPARATOR_SCALARS])
+    return widest
+
+
+@inline_kernel
+def gather(row: I64, var: I64, lists: I64, g: F64, eta: F64) -> None:
+    """eta = g of the variables of a clique, by its columns."""
+    x = 0
+    for k in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
+        s = var[lists[k], at.V_SCALAR]
+        for a in range(dim_of_variable(var, lists[k])):
+            eta[x] = g[s + a]
+            x += 1
+
+
+@inline_kernel
+def scatter(row: I64, var: I64, lists: I64, eta: F64, g: F64) -> None:
+    """g of the variables of a clique = eta."""
+    x = 0
+    for k in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
+        s = var[lists[k], at.V_SCALAR]
+        for a in range(dim_of_variable(var, lists[k])):
+            g[s + a] = eta[x]
+            x += 1
