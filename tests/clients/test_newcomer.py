@@ -16,7 +16,7 @@ from factorbus.cli.output.exits import BAD_FILE, FAILED, OK, REFUSED, UNAVAILABL
 from factorbus.cli.output.starts import ratio_to
 from factorbus.cli.process.bus import open_bus
 from factorbus.client import Draft, connect
-from factorbus.formats import read
+from factorbus.formats import read, recoded
 from factorbus.proto.problems import NobodyListens
 from factorbus.proto.version import __version__
 
@@ -110,10 +110,11 @@ def test_a_map_is_saved_whole_or_the_way_of_each_robot(
     whole, way = tmp_path / "yard.g2o", tmp_path / "way.tum"
     assert save(str(whole)) == [str(whole)]
     assert whole.read_text().count("EDGE_SE2") == 9
-    others = [tmp_path / f"yard.{form}" for form in ("pyfg", "jrl")]
+    others = [tmp_path / f"yard.{form}" for form in ("pyfg", "jrl", "jrl.cbor")]
     for other in others:
         assert save(str(other)) == [str(other)]
         assert read(other).batch.factor_count == 9
+    assert others[2].read_bytes() == recoded(others[1].read_text())
     assert save(str(way), "--robot", "a") == [str(way)]
     assert [float(line.split()[2]) for line in way.read_text().splitlines()] == [97.0] * 4
     each = save(str(tmp_path / "all.kitti"))

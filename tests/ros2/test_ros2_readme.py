@@ -3,6 +3,7 @@
 import re
 import shlex
 import signal
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,9 @@ from processes import Process
 from factorbus.cli.commands import replay
 from factorbus.cli.commands.ros2 import command
 from factorbus.cli.main import main
+from factorbus.proto.problems import Unavailable
 from factorbus.ros2.messages import TRANSFORMS
+from factorbus.ros2.node import open_node
 from factorbus.ros2.settings import Floors, Settings
 
 README = (Path(__file__).parents[2] / "deploy" / "ros2" / "README.md").read_text(encoding="utf-8")
@@ -60,6 +63,15 @@ def test_its_commands_run(spawn: Callable[..., Process]) -> None:
         assert any(token.endswith("/NN/%/%/factorbus") for token in tokens)
     bridge.signal(signal.SIGINT)
     assert bridge.wait() == 0
+
+
+def test_where_the_robots_router_is_not_there_it_is_said_how_to_start_it() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.raises(Unavailable, match=rf"^tcp/127.0.0.1:{port} .*`ros2 run rmw_zenoh_cpp rmw_zenohd`"):
+        open_node(f"tcp/127.0.0.1:{port}", 0, "/", "factorbus", 0.1, {})
+    assert "ros2 run rmw_zenoh_cpp rmw_zenohd" in README
 
 
 def test_its_options_and_numbers_are_those_of_the_command() -> None:

@@ -200,7 +200,6 @@ REFUSED = {
         "outlier_factors.b[0]: measurement 2 of entry 0, which is not there; wanted [entry, measurement]",
     ),
     "label": (lambda d: d["outlier_factors"].update(b=[[0]]), "outlier_factors.b[0]: an array of 1; wanted [entry, m"),
-    "whose": (lambda d: d.update(outlier_factors=[[0, 0]]), "outlier_factors: an array, and several robots; wanted an"),
     "name": (lambda d: d.update(name=7), "name: 7; wanted a string"),
 }
 

@@ -244,6 +244,22 @@ def test_slampp_has_the_names_of_g2o_too(tmp_path: Path, landmark: str) -> None:
     np.testing.assert_array_equal(landmarks.information, [[10, 2, 10]] * 2)
 
 
+def test_a_record_of_slampp_among_those_of_g2o_is_said_with_what_it_is_taken_for(tmp_path: Path) -> None:
+    """Vertices of points and FIX are read as g2o's, and the graph is that of the file in g2o's names."""
+    text = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nVERTEX_XY 3 2.5 1\nFIX 1\nEDGE_SE2 0 1 1 0 0.1 45 0 0 45 0 400\n"
+    text += "LANDMARK2 0 3 2 1 10 2 10\nLANDMARK2 1 3 1 1 10 2 10\n"
+    read_text(tmp_path, text)
+    graph = read(tmp_path / "a.g2o", strict=True)
+    (note,) = graph.notes
+    assert note.startswith("LANDMARK2 read beside EDGE_SE2, FIX, VERTEX_SE2, VERTEX_XY of g2o as slam++ has it: x y in")
+    same = read_text(tmp_path, text.replace("LANDMARK2", "EDGE_SE2_XY"), "b.g2o")
+    assert same.notes == ()
+    assert str(graph.batch) == str(same.batch)
+    left = read_text(tmp_path, text, dialect="g2o").left_out
+    assert left == {"LANDMARK2": 2, "vertices": 1}
+    assert read_text(tmp_path, "VERTEX2 0 0 0 0\n" + text.splitlines()[-2] + "\n").notes == ()
+
+
 def test_edges_of_two_dialects_that_weigh_differently_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"a record of g2o and slam\+\+"):
         read_text(tmp_path, loop() + "EDGE2 0 2 2 0 0 45 1 1 45 1 400\n")

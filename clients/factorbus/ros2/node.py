@@ -10,6 +10,8 @@ from zenoh.ext import HistoryConfig, declare_advanced_subscriber
 from zenoh.handlers import Callback
 
 from factorbus.client.link import open_session
+from factorbus.proto import redact
+from factorbus.proto.problems import Unavailable
 from factorbus.ros2.names import NodeName, Topic, attachment, gid, read_attachment
 
 _KEPT_S = 5.0  # for publishers to say what they have kept
@@ -130,4 +132,12 @@ def open_node(
     endpoint: str, domain: int, namespace: str, name: str, timeout_s: float, settings: Mapping[str, Any], file: str = ""
 ) -> Node:
     """A node at the router (or whatever listens) at `endpoint`.  Raises Unavailable, BadEndpoint, BadSetting."""
-    return Node(open_session([endpoint], timeout_s, settings, file), domain, namespace, name)
+    try:
+        session = open_session([endpoint], timeout_s, settings, file)
+    except Unavailable:
+        hint = (
+            "start ROS's router there with `ros2 run rmw_zenoh_cpp rmw_zenohd`, or leave --ros out where the robot's "
+            "sessions connect to the service itself"
+        )
+        raise Unavailable(redact.endpoint(endpoint), timeout_s, hint) from None
+    return Node(session, domain, namespace, name)

@@ -14,7 +14,7 @@ from factorbus.formats.whole_file import write_whole
 from factorbus.formats.writable import Written
 from factorbus.formats.write_g2o import as_g2o, g2o_text, write_g2o
 from factorbus.formats.write_graph import GRAPHS, write_graph
-from factorbus.formats.write_jrl import as_jrl, write_jrl
+from factorbus.formats.write_jrl import as_jrl, recoded, write_jrl
 from factorbus.formats.write_kitti import kitti_text, write_kitti
 from factorbus.formats.write_pyfg import as_pyfg, write_pyfg
 from factorbus.formats.write_tum import tum_notes, tum_text, write_tum
@@ -35,6 +35,7 @@ __all__ = [
     "g2o_text",
     "kitti_text",
     "read",
+    "recoded",
     "tum_notes",
     "tum_text",
     "write_g2o",

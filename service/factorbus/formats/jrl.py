@@ -4,7 +4,7 @@
      "measurements":   {"a": [{"stamp": t, "measurements": [{"type": ..., ...}, ...]}, ...], ...},
      "initialization": {"a": [{"type": "Pose2", "key": k, "x": ..., "y": ..., "theta": ...}, ...], ...},
      "groundtruth":    as the initialization,
-     "potential_outlier_factors", "outlier_factors":   {"a": [[entry, measurement], ...], ...}}
+     "potential_outlier_factors", "outlier_factors":   {"a": [[entry, measurement], ...], ...}}   or `outlier_labels`
 
 A robot is a letter, a key is a symbol as GTSAM packs it.  Measurements are {"type", "key", "prior", "covariance"} or
 {"type", "key1", "key2", "measurement", "covariance"}.  Values are objects; of 3D poses with "translation" x y z and
@@ -12,7 +12,8 @@ A robot is a letter, a key is a symbol as GTSAM packs it.  Measurements are {"ty
 of 3D poses the rotation comes first.  A stamp is a whole number from 0, here in nanoseconds.
 
 What the documents of JRL and its programs write differently is read in both ways: robots as letters or their codes,
-values as an array or by key, a number as itself or as {"type": "Scalar", "value": ...}.
+values as an array or by key, a number as itself or as {"type": "Scalar", "value": ...}, a direction as three numbers or
+as {"type": "Unit3", "i": ..., "j": ..., "k": ...}, and the whole in JSON or in CBOR (`cbor`).
 """
 
 from factorbus.formats.json_parts import Part
@@ -30,13 +31,15 @@ FACTORS = {
     "RangeFactor2D": "range_se2",
     "RangeFactor3D": "range_se3",
     "BearingRangeFactor2D": "bearing_range_se2",
+    "BearingRangeFactor3D": "landmark_se3",  # as `bearing_ranges` has it
 }
-POTENTIAL_OUTLIERS, OUTLIERS = "potential_outlier_factors", "outlier_factors"
-SCALAR, BEARING_RANGE, ROT2 = "Scalar", "BearingRange", "Rot2"
+BEARING_RANGE_3D = "BearingRangeFactor3D"
+SCALAR, BEARING_RANGE, ROT2, UNIT3 = "Scalar", "BearingRange", "Rot2", "Unit3"
 # What is measured, by the name of the factor.
 _MEASURED = {name: name.removeprefix("PriorFactor").removeprefix("BetweenFactor") for name in FACTORS}
 _MEASURED |= {name: SCALAR for name in FACTORS if name.startswith("RangeFactor")}
-_MEASURED |= {"BearingRangeFactor2D": BEARING_RANGE}
+_MEASURED |= {"BearingRangeFactor2D": BEARING_RANGE, BEARING_RANGE_3D: BEARING_RANGE}
+_BEARINGS = {BEARING_RANGE_3D: UNIT3}
 
 # Where the rows of our residual, x y z and a rotation, are in GTSAM's tangent space of 3D poses; and the other way.
 GTSAM_ORDER = (3, 4, 5, 0, 1, 2)
@@ -44,13 +47,15 @@ GTSAM_ORDER = (3, 4, 5, 0, 1, 2)
 
 def measured_numbers(name: str, part: Part) -> list[float]:
     """What a factor of that name has measured, in our order.  Raises FormatError."""
-    return value_numbers(_MEASURED[name], part)
+    return value_numbers(_MEASURED[name], part, _BEARINGS.get(name, ROT2))
 
 
-def value_numbers(name: str, part: Part) -> list[float]:
-    """The numbers of a value of that name, in our order.  Raises FormatError."""
+def value_numbers(name: str, part: Part, bearing: str = ROT2) -> list[float]:
+    """The numbers of a value of that name, in our order; bearing: what one is that it has.  Raises FormatError."""
     if name in (SCALAR, ROT2) and not isinstance(part.value, dict):
         return [part.number()]
+    if name == UNIT3 and not isinstance(part.value, dict):
+        return part.numbers(3)
     told = part.find("type")
     if told is not None and told.text() != name:
         raise told.refused(f'"{name}"')
@@ -58,8 +63,7 @@ def value_numbers(name: str, part: Part) -> list[float]:
         w, x, y, z = part.member("rotation").numbers(4)
         return [*part.member("translation").numbers(3), x, y, z, w]
     if name == BEARING_RANGE:
-        bearing, distance = value_numbers(ROT2, part.member("bearing")), value_numbers(SCALAR, part.member("range"))
-        return bearing + distance
+        return value_numbers(bearing, part.member("bearing")) + value_numbers(SCALAR, part.member("range"))
     return [part.member(field).number() for field in _FIELDS[name]]
 
 
@@ -69,7 +73,8 @@ def as_value(name: str, numbers: list[float]) -> dict[str, object]:
         *place, x, y, z, w = numbers
         return {"type": name, "translation": place, "rotation": [w, x, y, z]}
     if name == BEARING_RANGE:
-        return {"type": name, "bearing": as_value(ROT2, numbers[:1]), "range": as_value(SCALAR, numbers[1:])}
+        bearing = as_value(ROT2 if len(numbers) == 2 else UNIT3, numbers[:-1])
+        return {"type": name, "bearing": bearing, "range": as_value(SCALAR, numbers[-1:])}
     return {"type": name, **dict(zip(_FIELDS[name], numbers, strict=True))}
 
 
@@ -84,4 +89,5 @@ _FIELDS = {
     "Point3": ("x", "y", "z"),
     SCALAR: ("value",),
     ROT2: ("theta",),
+    UNIT3: ("i", "j", "k"),
 }

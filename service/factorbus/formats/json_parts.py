@@ -1,4 +1,4 @@
-"""A JSON file part by part: each knows its place in the file, for what is said of it."""
+"""A JSON or CBOR file part by part: each knows its place in the file, for what is said of it."""
 
 import json
 import math
@@ -11,7 +11,7 @@ _MOST_SHOWN = 40
 
 
 class Part(NamedTuple):
-    """A value of a JSON file, and its place there, such as `measurements.a[3].stamp`; "" for the whole.
+    """A value of the file, and its place there, such as `measurements.a[3].stamp`; "" for the whole.
 
     A file has as many as numbers: a frozen dataclass takes three times as long to make.
     """
@@ -91,7 +91,7 @@ def parsed_json(file: str, content: bytes) -> Part:
     """The whole of a JSON file in UTF-8.  Raises FormatError, with the line where it is no JSON."""
     wanted = "JSON in UTF-8, in which each object has a member once"
     try:
-        return Part(file, "", json.loads(content.decode(), object_pairs_hook=_members, parse_constant=_constant))
+        return Part(file, "", json.loads(content.decode(), object_pairs_hook=members_once, parse_constant=_constant))
     except json.JSONDecodeError as error:
         raise FormatError(file, error.lineno, f"no JSON at column {error.colno} ({error.msg})", wanted) from error
     except UnicodeDecodeError as error:
@@ -113,7 +113,8 @@ def _shown(value: Any) -> str:
     return {dict: "an object", list: "an array"}.get(type(value)) or abridged(json.dumps(value))
 
 
-def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def members_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of these members.  Raises ValueError where one is there twice."""
     found = dict(pairs)
     if len(found) != len(pairs):
         names = [name for name, _ in pairs]

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorbus.formats.assemble import KIND_WORDS, EdgeColumns, VertexColumns, assembled
+from factorbus.formats.bearing_ranges import positions_of_bearings
+from factorbus.formats.cbor import is_cbor, parsed_cbor
 from factorbus.formats.errors import FormatError, refuse_first
 from factorbus.formats.jrl import (
+    BEARING_RANGE_3D,
     FACTORS,
     GTSAM_ORDER,
-    OUTLIERS,
-    POTENTIAL_OUTLIERS,
     PRIORS,
     VALUES,
     measured_numbers,
@@ -22,6 +23,7 @@ from factorbus.formats.jrl import (
 )
 from factorbus.formats.json_parts import Part, abridged, parsed_json
 from factorbus.formats.left_out import LeftOut
+from factorbus.formats.outlier_labels import OUTLIERS, POTENTIAL_OUTLIERS, labelled_factors, listed, robots_in
 from factorbus.formats.robot_log import FactorLabels, RobotLog, first_mentions
 from factorbus.formats.rotations import normalized_poses
 from factorbus.formats.weights import checked_information, doubled_rotations, inverted_weights, packed_upper
@@ -74,8 +76,8 @@ class _Values:
 
 
 def is_jrl(content: bytes) -> bool:
-    """Whether a file is JSON, which no other form is."""
-    return content.lstrip()[:1] == b"{"
+    """Whether a file is JSON or CBOR, which no other form is."""
+    return content.lstrip()[:1] == b"{" or is_cbor(content)
 
 
 def read_jrl(file: str, content: bytes, left: LeftOut) -> tuple[Batch, tuple[I64, ...], RobotLog]:
@@ -84,7 +86,7 @@ def read_jrl(file: str, content: bytes, left: LeftOut) -> tuple[Batch, tuple[I64
     Measurements take turns by the stamps of their entries.  These are the time stamps of the poses that they are the
     first to name, unless all are 0.  Raises FormatError, which names the place in the file.
     """
-    document = parsed_json(file, content)
+    document = parsed_cbor(file, content) if is_cbor(content) else parsed_json(file, content)
     places: list[Part] = []  # what takes turn 0, 1, 2 ...
     entries = _entries(document)
     rows = _rows(entries, places, left)
@@ -99,11 +101,13 @@ def read_jrl(file: str, content: bytes, left: LeftOut) -> tuple[Batch, tuple[I64
     true = Batch(tuple(Variables(of.kind, of.ids, of.values) for of in known))
     log = RobotLog(
         "" if name is None else name.text(),
-        _labels(document, entries, rows, turns),
+        _labels(document, entries, rows, turns, left),
         _stamped(true, entries, rows, {**values.stamps, **truth.stamps}).variables,
     )
     if told := log.told():
         left.say(told)
+    if seen := len(rows.get(BEARING_RANGE_3D, [])):
+        left.say(f"{seen:,} {BEARING_RANGE_3D} read as positions in the frames of the poses, exact to first order")
     return _stamped(batch, entries, rows, values.stamps), turns, log
 
 
@@ -118,26 +122,13 @@ def _refuse_other_truth(values: _Values, truth: _Values, places: list[Part]) -> 
             raise places[value.turn].refused(f"all of the plane or all of space, as the {every[0][0]} before", name)
 
 
-def _robots(part: Part | None) -> Iterator[tuple[str, Part]]:
-    """The members of an object that has one for each robot.  Raises FormatError."""
-    for letter, of in (part.members() if part else {}).items():
-        if len(letter) != 1 or not letter.isascii():
-            raise of.refused("robots that are a letter each", f"the robot {abridged(letter)!r}")
-        yield letter, of
-
-
-def _listed(part: Part | None) -> list[Part]:
-    """What is in an array; nothing where there is none: programs of JRL write null for an empty one."""
-    return [] if part is None or part.value is None else part.items()
-
-
 def _entries(document: Part) -> list[_Entry]:
     """The entries of all robots by their stamps; those of one stamp in the order of the file.  Raises FormatError."""
     entries = []
-    for robot, part in _robots(document.member("measurements")):
-        for number, entry in enumerate(_listed(part)):
+    for robot, part in robots_in(document.member("measurements")):
+        for number, entry in enumerate(listed(part)):
             stamp = entry.member("stamp").whole(0, MOST_STAMP)
-            entries.append(_Entry(robot, number, stamp, _listed(entry.find("measurements"))))
+            entries.append(_Entry(robot, number, stamp, listed(entry.find("measurements"))))
     return sorted(entries, key=lambda entry: entry.stamp)
 
 
@@ -170,7 +161,7 @@ def _values(document: Part, what: str, places: list[Part], left: LeftOut) -> _Va
     found = _Values()
     foreign: dict[str, list[Part]] = defaultdict(list)
     seen: dict[int, tuple[str, list[float], Part]] = {}
-    for key, part in (each for _, of in _robots(document.find(what)) for each in _valued(of)):
+    for key, part in (each for _, of in robots_in(document.find(what)) for each in _valued(of)):
         name = part.member("type").text()
         if name not in VALUES:
             foreign[name].append(part)
@@ -194,7 +185,7 @@ def _values(document: Part, what: str, places: list[Part], left: LeftOut) -> _Va
 def _valued(of_robot: Part) -> Iterator[tuple[int, Part]]:
     """(key, value) of a robot, whether they are in an array or by their keys.  Raises FormatError."""
     if not isinstance(of_robot.value, dict):
-        yield from ((value.member("key").whole(0, MAX_KEY), value) for value in _listed(of_robot))
+        yield from ((value.member("key").whole(0, MAX_KEY), value) for value in listed(of_robot))
         return
     for name, value in of_robot.members().items():
         if not (name.isascii() and name.isdigit() and len(name) < 20 and int(name) <= MAX_KEY):
@@ -258,6 +249,13 @@ def _edges(file: str, name: str, rows: list[_Row]) -> EdgeColumns:
         refuse_first(file, turns, bad, lambda row: f"{name} of {measured[row, -1]:g}", "a distance above 0")
     if about.size == 7:
         measured = normalized_poses(file, name, turns, measured)
+    if name == BEARING_RANGE_3D:
+        length = np.linalg.norm(measured[:, :3], axis=1)
+        refuse_first(file, turns, length == 0, lambda _: f"{name} along no direction", "a direction of some length")
+        measured[:, :3] /= length[:, None]
+        _checked_covariance(file, name, turns, covariance)
+        measured, covariance = positions_of_bearings(measured, covariance)
+        covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
     information = _information(file, name, turns, covariance)
     return EdgeColumns(about.name, turns, keys, np.ascontiguousarray(measured), information)
 
@@ -265,16 +263,21 @@ def _edges(file: str, name: str, rows: list[_Row]) -> EdgeColumns:
 def _information(file: str, name: str, turns: I64, covariance: F64) -> F64:
     """Information of whole covariances (n, d, d) in GTSAM's order, packed in ours.  Raises FormatError."""
     about = FACTOR_KINDS[FACTORS[name]]
+    if about.half_angles:
+        covariance = covariance[:, GTSAM_ORDER][:, :, GTSAM_ORDER]
+    packed = _checked_covariance(file, name, turns, covariance)
+    information = inverted_weights(packed, about.dim)
+    information = doubled_rotations(information) if about.half_angles else information
+    return np.ascontiguousarray(checked_information(file, name, turns, information, about.dim))
+
+
+def _checked_covariance(file: str, name: str, turns: I64, covariance: F64) -> F64:
+    """Whole covariances, packed.  Raises FormatError where one is none."""
     apart = np.abs(covariance - np.swapaxes(covariance, 1, 2)).max(axis=(1, 2))
     askew = ~(apart <= _SYMMETRIC * np.abs(covariance).max(axis=(1, 2)))
     wanted = "a symmetric positive definite matrix"
     refuse_first(file, turns, askew, lambda row: f"{name} with a covariance matrix that is not symmetric", wanted)
-    if about.half_angles:
-        covariance = covariance[:, GTSAM_ORDER][:, :, GTSAM_ORDER]
-    packed = checked_information(file, name, turns, packed_upper(covariance), about.dim, "a covariance")
-    information = inverted_weights(packed, about.dim)
-    information = doubled_rotations(information) if about.half_angles else information
-    return np.ascontiguousarray(checked_information(file, name, turns, information, about.dim))
+    return checked_information(file, name, turns, packed_upper(covariance), covariance.shape[1], "a covariance")
 
 
 def _stamped(
@@ -296,11 +299,16 @@ def _stamped(
 
 
 def _labels(
-    document: Part, entries: list[_Entry], rows: Mapping[str, list[_Row]], turns: tuple[I64, ...]
+    document: Part,
+    entries: list[_Entry],
+    rows: Mapping[str, list[_Row]],
+    turns: tuple[I64, ...],
+    left: LeftOut,
 ) -> tuple[FactorLabels, ...]:
     """What else is said of the factors.  Raises FormatError."""
     by_turn = {row.turn: row for of in rows.values() for row in of}
-    potential, outlier = (_outliers(document, entries, name) for name in (POTENTIAL_OUTLIERS, OUTLIERS))
+    sizes = {(entry.robot, entry.number): len(entry.measurements) for entry in entries}
+    potential, outlier = (labelled_factors(document, name, sizes, left) for name in (POTENTIAL_OUTLIERS, OUTLIERS))
 
     def flags(group: list[_Row], chosen: set[tuple[str, int, int]]) -> NDArray[np.bool]:
         return np.array([(row.entry.robot, row.entry.number, row.number) in chosen for row in group], bool)
@@ -312,27 +320,3 @@ def _labels(
         robots = np.array([ord(row.entry.robot) for row in group], np.int64)
         labels.append(FactorLabels(stamps, robots, flags(group, potential), flags(group, outlier)))
     return tuple(labels)
-
-
-def _outliers(document: Part, entries: list[_Entry], name: str) -> set[tuple[str, int, int]]:
-    """(robot, entry, measurement) of what is in a list of labels.  Raises FormatError."""
-    sizes = {(entry.robot, entry.number): len(entry.measurements) for entry in entries}
-    robots = {entry.robot for entry in entries}
-    part = document.find(name)
-    if part is not None and isinstance(part.value, list):  # as JRL's documents have it, which names no robot
-        if len(robots) > 1 and part.value:
-            raise part.refused("an object with an array for each robot", "an array, and several robots")
-        lists = [(robot, part) for robot in robots]
-    else:
-        lists = list(_robots(part))
-    found = set()
-    for robot, of in lists:
-        for pair in _listed(of):
-            ends = pair.items()
-            if len(ends) != 2:
-                raise pair.refused("[entry, measurement]", f"an array of {len(ends)}")
-            at, number = (end.whole(0, MOST_STAMP) for end in ends)
-            if number >= sizes.get((robot, at), 0):
-                raise pair.refused("[entry, measurement]", f"measurement {number} of entry {at}, which is not there")
-            found.add((robot, at, number))
-    return found

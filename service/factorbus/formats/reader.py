@@ -24,7 +24,7 @@ from factorbus.formats.read_bal import BAL, is_bal, read_bal
 from factorbus.formats.read_jrl import is_jrl, read_jrl
 from factorbus.formats.read_pyfg import is_pyfg, read_pyfg
 from factorbus.formats.read_tum import TUM, is_trajectory, read_trajectory
-from factorbus.formats.records import DIALECTS, G2O, SWITCH_PRIOR, Dialect, Vertex
+from factorbus.formats.records import DIALECTS, FIX, G2O, SWITCH_PRIOR, Dialect, Vertex
 from factorbus.formats.rotations import normalized_poses
 from factorbus.formats.sniff import dialect_named, sniffed
 from factorbus.proto.arrays import I64
@@ -84,7 +84,7 @@ def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFi
         _vertices(file, name, chosen.vertices[name], buckets[name]) for name in buckets if name in chosen.vertices
     ]
     edges = _edges(file, chosen, buckets, vertices, left)
-    fixes = _fixes(file, buckets["FIX"]) if chosen is G2O and "FIX" in buckets else None
+    fixes = _fixes(file, buckets[FIX]) if FIX in chosen.others and FIX in buckets else None
     if dialect is None:
         _refuse_mixed(file, chosen, buckets)
     _leave_foreign(file, chosen, buckets, left)
@@ -233,5 +233,5 @@ def _fixes(file: str, bucket: Bucket) -> tuple[I64, I64]:
         (word, line) for rest, line in zip(bucket.rests, bucket.numbers, strict=True) for word in rest.split() or [b""]
     ]
     flat = Bucket([word for word, _ in words], [line for _, line in words])
-    ids, _ = read_numbers(file, "FIX", flat, 1, 1, "the id of a vertex")
+    ids, _ = read_numbers(file, FIX, flat, 1, 1, "the id of a vertex")
     return ids[:, 0], np.array(flat.numbers, np.int64)

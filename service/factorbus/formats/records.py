@@ -107,6 +107,7 @@ class Dialect:
 
 OFFSETS = {"PARAMS_SE2OFFSET": "se2", "PARAMS_SE3OFFSET": "se3"}
 SWITCH_PRIOR = "EDGE_SWITCH_PRIOR"
+FIX = "FIX"
 _POSITION_SE2 = Edge("position_se2", sized=2)
 _POSITION_SE3 = Edge("position_se3", sized=3, parameters=1, optional=True, applied=False)
 _PRIOR_SE3 = Edge("prior_se3", parameters=1, optional=True)
@@ -148,7 +149,7 @@ G2O = Dialect(
         "EDGE_SE3_MAXMIX": Edge("between_se3", lead="mixture"),
         "EDGE_SE3:QUAT_MAXMIX": Edge("between_se3", lead="mixture"),
     },
-    others=("FIX", *OFFSETS),
+    others=(FIX, *OFFSETS),
 )
 
 _TORO_3D = "readers of 3D TORO files do not agree on the order of the information; convert the file to g2o"
@@ -178,10 +179,15 @@ ISAM = Dialect(
     one_numbering=False,
 )
 
-# Its parser has g2o's names of the plane, too, with the same numbers.
+# Its parser has g2o's names of the plane, too, with the same numbers; vertices of points and FIX come with mixtures.
 SLAMPP = Dialect(
     "slam++",
-    vertices={"VERTEX2": Vertex("se2"), "VERTEX": Vertex("se2"), "VERTEX_SE2": Vertex("se2")},
+    vertices={
+        "VERTEX2": Vertex("se2"),
+        "VERTEX": Vertex("se2"),
+        "VERTEX_SE2": Vertex("se2"),
+        "VERTEX_XY": Vertex("point2"),
+    },
     edges={
         "ODOMETRY": Edge("between_se2"),
         "EDGE2": Edge("between_se2"),
@@ -192,6 +198,7 @@ SLAMPP = Dialect(
         "LANDMARK2:XY": Edge("landmark_se2"),
         "EDGE_SE2_XY": Edge("landmark_se2"),
     },
+    others=(FIX,),
     refused={"EDGE3": _SLAMPP_3D, "EDGE3:AXISANGLE": _SLAMPP_3D},
 )
 

@@ -41,7 +41,7 @@ def sniffed(path: Path, buckets: Mapping[str, Bucket]) -> Guess:
     """
     names = set(buckets)
     if names & _SLAMPP_ONLY:
-        return Guess(SLAMPP)
+        return Guess(SLAMPP, _beside_g2o(names))
     if "VERTEX2" in names and (names & _ISAM_TOO or _is_never_toro(buckets.get("EDGE2"))):
         seen = ", ".join(sorted(names & (_ISAM_TOO | {"EDGE2"})))
         return Guess(SLAMPP, _assumed(SLAMPP, f"it has VERTEX2 beside {seen} with the information row by row", TORO))
@@ -65,6 +65,17 @@ def sniffed(path: Path, buckets: Mapping[str, Bucket]) -> Guess:
         f"unknown record {shown!r}",
         "g2o (EDGE_SE2, EDGE_SE3:QUAT, ...), TORO (EDGE2, VERTEX2), iSAM (ODOMETRY, LANDMARK, EDGE3) or PyFactorGraph "
         "records, or TUM",
+    )
+
+
+def _beside_g2o(names: set[str]) -> str:
+    """What SLAM++'s records in a file are taken for that has g2o's, too; empty: it has none of g2o."""
+    theirs, ours = sorted(names & _SLAMPP_ONLY), sorted(names & set(G2O.names))
+    if not ours:
+        return ""
+    return (
+        f"{' and '.join(theirs)} read beside {', '.join(ours)} of g2o as {SLAMPP.name} has it: x y in the frame of the "
+        "pose, and the information itself, row by row; if that is wrong: --dialect g2o, which leaves it out"
     )
 
 

@@ -7,11 +7,11 @@ from factorbus.formats.errors import FormatError
 from factorbus.formats.left_out import LeftOut
 from factorbus.formats.robot_log import RobotLog
 from factorbus.formats.write_g2o import write_g2o
-from factorbus.formats.write_jrl import write_jrl
+from factorbus.formats.write_jrl import CBOR, write_jrl
 from factorbus.formats.write_pyfg import write_pyfg
 from factorbus.proto.messages import Batch
 
-GRAPHS = (".g2o", ".pyfg", ".jrl")
+GRAPHS = (".g2o", ".pyfg", ".jrl", CBOR)  # CBOR: a JRL, coded so
 
 
 def write_graph(
@@ -19,12 +19,12 @@ def write_graph(
 ) -> tuple[str, ...]:
     """Write `batch`, and what a JRL has beside it; returns what was left out, for people.  Raises FormatError.
 
-    ids: of a .g2o (`write_g2o`).  log: what is known beside the graph; only a .jrl has a place for it.
+    ids: of a .g2o (`write_g2o`).  log: what is known beside the graph; only a JRL has a place for it.
     """
     ending = Path(path).suffix
     if ending not in GRAPHS:
         raise FormatError(str(path), None, f"the ending {ending!r}", f"one of {', '.join(GRAPHS)}")
-    if ending == ".jrl":
+    if ending in (".jrl", CBOR):
         return write_jrl(path, batch, strict, log)
     left = LeftOut(str(path), strict)
     if log is not None:

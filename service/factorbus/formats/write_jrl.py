@@ -14,9 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from factorbus.formats.bearing_ranges import bearings_of_positions
+from factorbus.formats.cbor import as_cbor
 from factorbus.formats.errors import FormatError
-from factorbus.formats.jrl import FACTORS, GTSAM_ORDER, JRL, OUTLIERS, POTENTIAL_OUTLIERS, VALUES, as_measured, as_value
+from factorbus.formats.jrl import BEARING_RANGE_3D, FACTORS, GTSAM_ORDER, JRL, VALUES, as_measured, as_value
 from factorbus.formats.left_out import LeftOut
+from factorbus.formats.outlier_labels import OUTLIERS, POTENTIAL_OUTLIERS
 from factorbus.formats.robot_log import RobotLog, first_mentions
 from factorbus.formats.weights import doubled_rotations, inverted_weights, unpacked_symmetric
 from factorbus.formats.whole_file import write_whole
@@ -36,6 +39,7 @@ _FORM = Form(
     fixes=False,
 )
 _NOBODY = "a"  # the robot of keys without a letter
+CBOR = ".cbor"  # the ending of a file that is coded so
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +58,19 @@ class _Measurement:
 def write_jrl(
     path: str | os.PathLike[str], batch: Batch, strict: bool = False, log: RobotLog | None = None
 ) -> tuple[str, ...]:
-    """Write `batch` to a path, as `as_jrl` makes it; returns its notes.  Raises FormatError."""
-    written = as_jrl(batch, strict, log, Path(path).stem)
-    write_whole(path, written.text, encoding="ascii")
-    return written.notes
+    """Write `batch` to a path, as `as_jrl` makes it, in CBOR for .cbor; returns its notes.  Raises FormatError."""
+    left = LeftOut(JRL, strict)
+    document = _document(batch, log, Path(path).stem.removesuffix(f".{JRL}"), left)
+    if Path(path).suffix == CBOR:
+        write_whole(path, as_cbor(document))
+    else:
+        write_whole(path, _text(document), encoding="ascii")
+    return tuple(left.notes)
+
+
+def recoded(text: str) -> bytes:
+    """JRL text in CBOR, as a .cbor has it."""
+    return as_cbor(json.loads(text))
 
 
 def as_jrl(batch: Batch, strict: bool = False, log: RobotLog | None = None, name: str = "factorbus") -> Written:
@@ -70,8 +83,15 @@ def as_jrl(batch: Batch, strict: bool = False, log: RobotLog | None = None, name
     FormatError, before anything is written.
     """
     left = LeftOut(JRL, strict)
+    text = _text(_document(batch, log, name, left))
+    return Written(text, tuple(left.notes), dict(left.counts))
+
+
+def _document(batch: Batch, log: RobotLog | None, name: str, left: LeftOut) -> dict[str, Any]:
+    """What the file says.  Raises FormatError."""
     _refuse_negative(batch)
     kept = writable(batch, _FORM, left)
+    _say_bearings(kept, left)
     robots = _robots(kept)
     measurements = sorted(_measurements(kept, robots, log), key=lambda one: (one.stamp, one.turn))
     beside = _beside(kept.variables, measurements, left)
@@ -79,11 +99,22 @@ def as_jrl(batch: Batch, strict: bool = False, log: RobotLog | None = None, name
     letters = sorted({*robots.values(), *entries})
     document: dict[str, Any] = {"name": log.name if log else name, "robots": [ord(letter) for letter in letters]}
     document["measurements"] = {letter: [_entry(one) for one in entries.get(letter, [])] for letter in letters}
-    document["initialization"] = _values(kept.variables, letters, robots, beside)
-    document["groundtruth"] = _values(log.ground_truth if log else (), letters, robots, {})
-    document[POTENTIAL_OUTLIERS] = {a: _places(entries.get(a, []), lambda one: one.potential) for a in letters}
-    document[OUTLIERS] = {a: _places(entries.get(a, []), lambda one: one.outlier) for a in letters}
-    return Written(_text(document), tuple(left.notes), dict(left.counts))
+    beside_them = {
+        "initialization": _values(kept.variables, letters, robots, beside),
+        "groundtruth": _values(log.ground_truth if log else (), letters, robots, {}),
+        POTENTIAL_OUTLIERS: {a: _places(entries.get(a, []), lambda one: one.potential) for a in letters},
+        OUTLIERS: {a: _places(entries.get(a, []), lambda one: one.outlier) for a in letters},
+    }
+    return document | {title: of for title, of in beside_them.items() if any(of.values())}
+
+
+def _say_bearings(batch: Batch, left: LeftOut) -> None:
+    """What of points in space is written as directions and distances.  Raises FormatError."""
+    seen = np.concatenate([np.empty((0, 3)), *(of.measured for of in batch.factors if of.kind == "landmark_se3")])
+    nowhere = int((~seen.any(axis=1)).sum())
+    left.drop("landmark_se3", nowhere, "a point that is where its pose is has no direction")
+    if len(seen) > nowhere:
+        left.say(f"{len(seen) - nowhere:,} landmark_se3 written as {BEARING_RANGE_3D}, exact to first order")
 
 
 def _refuse_negative(batch: Batch) -> None:
@@ -116,6 +147,8 @@ def _measurements(batch: Batch, robots: Mapping[int, str], log: RobotLog | None)
     for number, group in enumerate(batch.factors):
         labels = log.labels[number] if log and log.labels else None
         for row, (keys, record) in enumerate(zip(group.keys.tolist(), _records(group), strict=True)):
+            if record is None:
+                continue
             last = max(keys, key=lambda key: turn.get(key, -1))
             robot, stamp = robots[last], times.get(last, 0)
             potential = outlier = False
@@ -132,16 +165,22 @@ def _times(group: Variables) -> Iterator[tuple[int, int | None]]:
         yield key, None if stamp == NO_STAMP else stamp
 
 
-def _records(group: Factors) -> Iterator[dict[str, Any]]:
-    """Measurements as JSON has them."""
+def _records(group: Factors) -> Iterator[dict[str, Any] | None]:
+    """Measurements as JSON has them; None: there is no record for it."""
     name, kind = _FACTOR_NAMES[group.kind], FACTOR_KINDS[group.kind]
     packed = inverted_weights(group.information, kind.dim)
     covariance = unpacked_symmetric(doubled_rotations(packed) if kind.half_angles else packed, kind.dim)
     if kind.half_angles:
         covariance = covariance[:, GTSAM_ORDER][:, :, GTSAM_ORDER]
+    measured = group.measured
+    if name == BEARING_RANGE_3D:
+        with np.errstate(invalid="ignore"):  # of points that are where their pose is
+            measured, covariance = bearings_of_positions(measured, covariance)
     flat = covariance.reshape(-1, kind.dim**2).tolist()
-    for keys, numbers, row in zip(group.keys.tolist(), group.measured.tolist(), flat, strict=True):
-        if len(keys) == 1:
+    for keys, numbers, row in zip(group.keys.tolist(), measured.tolist(), flat, strict=True):
+        if name == BEARING_RANGE_3D and numbers[-1] == 0.0:
+            yield None
+        elif len(keys) == 1:
             yield {"type": name, "key": keys[0], "prior": as_measured(name, numbers), "covariance": row}
         else:
             ends = {"key1": keys[0], "key2": keys[1]}
@@ -193,12 +232,12 @@ def _places(entries: list[list[_Measurement]], chosen: Callable[[_Measurement], 
 
 
 def _text(document: dict[str, Any]) -> str:
-    """One line for each entry and each value; what is empty is not there, but for the measurements."""
+    """One line for each entry and each value."""
     lines = []
     for title, content in document.items():
         if not isinstance(content, dict):
             lines.append(f"{json.dumps(title)}: {json.dumps(content)}")
-        elif title == "measurements" or any(content.values()):
+        else:
             robots = [f"{json.dumps(letter)}: [{_lines(content[letter])}]" for letter in content]
             lines.append(f"{json.dumps(title)}: {{{', '.join(robots)}}}")
     return "{" + ",\n".join(lines) + "}\n"

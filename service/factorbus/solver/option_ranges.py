@@ -90,7 +90,13 @@ SWITCHES = ("reuse_factor", "initialize_locally", "constrain_last_pose")
 def check_numbers(settings: Any) -> None:
     """Every number of a dataclass in its range, every switch True or False.  Raises BadOption."""
     for name in settings.__slots__:
-        if (allowed := RANGES.get(name)) and not allowed.takes(value := getattr(settings, name)):
-            raise BadOption(name, repr(value), str(allowed))
+        if name in RANGES:
+            check_number(name, getattr(settings, name))
         if name in SWITCHES and not isinstance(value := getattr(settings, name), bool):
             raise BadOption(name, repr(value), "True or False")
+
+
+def check_number(name: str, value: Any) -> None:
+    """That it is in the range of the option of that name.  Raises BadOption."""
+    if not (allowed := RANGES[name]).takes(value):
+        raise BadOption(name, repr(value), str(allowed))

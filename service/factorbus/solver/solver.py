@@ -11,7 +11,6 @@ from factorbus.solver.changes.convert_to_points import find_convertible
 from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.source import CovarianceSource
-from factorbus.solver.errors import BadOption
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.columns import Columns
@@ -23,6 +22,7 @@ from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.sparse.fronts import LANES
 from factorbus.solver.modes import mode_named
+from factorbus.solver.option_ranges import check_number
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport
 from factorbus.solver.sparse.cholmod import require_cholmod
@@ -74,15 +74,15 @@ class Solver:
     def step(self, settle: bool = False, budget: float | None = None) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
 
-        budget: in the place of `Options.step_budget`, for this step.
+        budget: in the place of `Options.step_budget`, for this step, and of its range.
 
         Raises BadOption; or Underconstrained or NotFinite, and what was staged since the last step is taken back then,
         and the solver is as it was after that step, bit for bit.
         """
         if budget is None:
             budget = self._options.step_budget
-        elif not budget >= 0.0:
-            raise BadOption("budget", repr(budget), "0 or more, 0: without bound")
+        else:
+            check_number("step_budget", budget)
         return self._stepper.step(settle, budget)
 
     def estimate(self) -> list[Group]:

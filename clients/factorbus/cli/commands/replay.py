@@ -24,7 +24,7 @@ from factorbus.cli.process.options import (
     out_option,
     zenoh_option,
 )
-from factorbus.cli.process.reading import reading_options, say
+from factorbus.cli.process.reading import ROBOT_LOGS, reading_options, say
 from factorbus.cli.process.robot_options import robot_options
 from factorbus.ros2.options import RobotOptions
 
@@ -118,7 +118,7 @@ class ReplayRequest:
 )
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
 @out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
-@out_option("--out", "out", "Write the estimate and the factors, in the form of the ending.", "FILE.g2o|.pyfg|.jrl")
+@out_option("--out", "out", "Write the estimate and the factors, by the ending.", "FILE.g2o|.pyfg|.jrl|.cbor")
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @reading_options
 @robot_options(usual=False)
@@ -349,7 +349,7 @@ def _write(request: ReplayRequest, target: Any, source: Any, steps: Any) -> list
 
 def _truth_of(source: Any, out: Path) -> Any:
     """Of the log that was read what a file of the map can have: a map has no labels of factors."""
-    return replace(source.log, labels=()) if source.log and out.suffix == ".jrl" else None
+    return replace(source.log, labels=()) if source.log and out.suffix in ROBOT_LOGS else None
 
 
 def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any, truth: Any) -> None:

@@ -7,7 +7,7 @@ import click
 
 from factorbus.cli.output.exits import REFUSED, Stopped, output_file
 from factorbus.cli.process.options import checked_output, connect_option, timeout_option, zenoh_option
-from factorbus.cli.process.reading import GRAPHS, IDS, check_chosen
+from factorbus.cli.process.reading import GRAPHS, IDS, ROBOT_LOGS, check_chosen
 
 if TYPE_CHECKING:
     from factorbus.client import Map
@@ -31,8 +31,8 @@ _WRITES = (*GRAPHS, ".tum", ".kitti")
 def command(
     name: str, target: Path, robot: str | None, ids: str | None, endpoint: str, zenoh: str, timeout_s: float
 ) -> None:
-    """Write MAP as it is now into FILE: the whole graph as .g2o, .pyfg or .jrl, or trajectories as .tum or
-    .kitti, by its ending.
+    """Write MAP as it is now into FILE: the whole graph as .g2o, .pyfg, .jrl or .jrl.cbor, or trajectories as .tum
+    or .kitti, by its ending.
 
     A trajectory is of one robot, the letter of its poses' keys. Of several each gets a file of its own: out.tum becomes
     out-a.tum and out-b.tum. Its times are the poses' time stamps, and where no pose has one the numbers of their keys;
@@ -48,9 +48,9 @@ def command(
         raise click.BadParameter(f"{target} does not end in {', '.join(_WRITES)}", param_hint="FILE")
     check_chosen(target, robot, ids)
     from factorbus.cli.process.bus import open_bus
-    from factorbus.formats import write_whole
+    from factorbus.formats import recoded, write_whole
 
-    form = target.suffix.removeprefix(".")
+    form = "jrl" if target.suffix in ROBOT_LOGS else target.suffix.removeprefix(".")
     with open_bus(endpoint, "save", zenoh, timeout_s) as bus, bus.map(name, mirror=False, create=False) as joined:
         robots = [] if target.suffix in GRAPHS else _robots(joined, robot)
         texts = (
@@ -61,7 +61,7 @@ def command(
     for letter, text in texts.items():
         path = target if len(texts) == 1 else target.with_name(f"{target.stem}-{letter or 'none'}{target.suffix}")
         with output_file(path):
-            write_whole(path, text)
+            write_whole(path, recoded(text) if path.suffix == ".cbor" else text)
         click.echo(path)
 
 

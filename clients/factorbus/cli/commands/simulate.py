@@ -15,7 +15,7 @@ from factorbus.wording import counted
 @click.argument("world", type=click.Choice((*WORLDS, "inertial")))
 @click.option("--poses", type=click.IntRange(2, 1_000_000), default=3500, show_default=True, metavar="N")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
-@out_option("--out", "out", "What the robot measured; a .jrl has the truth as well.", "FILE.g2o|.pyfg|.jrl")
+@out_option("--out", "out", "What the robot measured; a .jrl has the truth as well.", "FILE.g2o|.pyfg|.jrl|.cbor")
 @click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False),
@@ -51,7 +51,7 @@ def command(world: str, poses: int, seed: int, out: Path | None, folder: Path | 
         raise click.UsageError("there is nothing to write: give --out FILE.g2o, --truth FILE.tum or both")
     from factorbus.cli.driving.columns import merged
     from factorbus.cli.output import console as screen
-    from factorbus.cli.process.reading import say
+    from factorbus.cli.process.reading import ROBOT_LOGS, say
     from factorbus.formats import RobotLog, write_graph, write_tum
     from factorbus.proto.messages import Batch
 
@@ -65,7 +65,7 @@ def command(world: str, poses: int, seed: int, out: Path | None, folder: Path | 
     if out:
         graph = merged(batches)
         with output_file(out):
-            log = RobotLog(world, (), merged(truths).variables) if out.suffix == ".jrl" else None
+            log = RobotLog(world, (), merged(truths).variables) if out.suffix in ROBOT_LOGS else None
             notes = write_graph(out, graph, ids="counted", log=log)  # ids of a .g2o that every program reads
         say(out, notes)
         screen.print_note(f"{out}: {counted(poses, 'pose')}, {counted(graph.factor_count, 'factor')}")

@@ -52,7 +52,7 @@ def _covariance(ctx: click.Context, parameter: click.Parameter, text: str | None
     "--out",
     "out",
     "Write the graph at its optimum, or the trajectory, in the form of the ending.",
-    "FILE.g2o|.pyfg|.jrl|.tum|.kitti",
+    "FILE.g2o|.pyfg|.jrl|.cbor|.tum|.kitti",
 )
 @click.option(
     "--start",

@@ -13,7 +13,7 @@ from factorbus.cli.driving.replay_source import source_of
 from factorbus.cli.output.console import print_note
 from factorbus.cli.output.exits import USAGE, Stopped, output_file
 from factorbus.cli.output.starts import NOT_CONVERGED
-from factorbus.cli.process.reading import COUNTED, GRAPHS, say
+from factorbus.cli.process.reading import COUNTED, GRAPHS, ROBOT_LOGS, say
 from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import format_symbol
 from factorbus.wording import counted
@@ -222,7 +222,7 @@ def _write(out: Path, graph: Batch, source: Any, strict: bool) -> list[Path]:
         if out.suffix in GRAPHS:
             ids = source.numbering if getattr(source, "numbering", "ids") != "ids" else "auto"
             log = getattr(source, "log", None)
-            kept = replace(log, labels=()) if log and out.suffix == ".jrl" else None
+            kept = replace(log, labels=()) if log and out.suffix in ROBOT_LOGS else None
             notes, files = write_graph(out, graph, strict, ids, kept), [out]
         else:
             kitti = out.suffix == ".kitti"

@@ -16,7 +16,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 DIALECTS = ("g2o", "toro", "isam", "slam++", "pyfg", "jrl", "tum", "bal")
 COUNTED = (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))  # of a graph, and of one of them
 IDS = ("auto", "ids", "keys", "counted")
-GRAPHS = (".g2o", ".pyfg", ".jrl")  # endings of files that are written with the whole graph; others are trajectories
+GRAPHS = (".g2o", ".pyfg", ".jrl", ".cbor")  # endings of files with the whole graph; others are trajectories
+ROBOT_LOGS = (".jrl", ".cbor")  # those that have ground truth and labels beside it; a .jrl.cbor is a .jrl in CBOR
 
 
 def reading_options(command: F) -> F:
