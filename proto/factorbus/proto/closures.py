@@ -29,7 +29,7 @@ class ClosureEntry:
     """An entry of a journal: what some closures are from now on.  factors (n,): ids; a state and a reason of each.
 
     distance (n,): d²; chance (n,): the odds that it is false; tried (n,): the newest rival at the last trial, −1:
-    none.
+    none.  ahead: they are believed, and went in with the step of the insert before.
     """
 
     sequence: int
@@ -39,6 +39,7 @@ class ClosureEntry:
     distance: F64
     chance: F64
     tried: I64
+    ahead: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +85,7 @@ def encode_closure_entry(message: ClosureEntry) -> bytes:
             "distance": _bytes(message.distance, F8),
             "chance": _bytes(message.chance, F8),
             "tried": _bytes(message.tried, I8),
+            **({"ahead": True} if message.ahead else {}),
         }
     )
 
@@ -100,6 +102,7 @@ def decode_closure_entry(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> 
         _numbers(content, "distance", factors.size),
         _numbers(content, "chance", factors.size),
         _integers(content, "tried", factors.size),
+        fields.flag("", content, "ahead"),
     )
 
 

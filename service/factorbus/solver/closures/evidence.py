@@ -158,6 +158,12 @@ def odds_without(c: ClosureNumbers, spread: FalseSpread) -> F64:
     return _odds(FULL * root * np.exp(0.5 * np.minimum(distance, MOST_DISTANCE)), [spread])[:, 0]
 
 
+def odds_of_weights(W: F64, distance: F64, spread: FalseSpread) -> F64:
+    """p (n,) of closures in the plane with S⁻¹ = W."""
+    root = 1.0 / np.sqrt(np.linalg.det(W))
+    return _odds(FULL * root * np.exp(0.5 * np.minimum(distance, MOST_DISTANCE)), [spread])[:, 0]
+
+
 def volume_of(spread: FalseSpread) -> float:
     """Of where false ones are, metres² radians."""
     return 8.0 * spread.metres**2 * spread.radians

@@ -12,6 +12,7 @@ trial: they are to stay out if more places' closures are believed then.
 All of it follows from the estimate and the ledger: the same ones give the same verdicts.
 """
 
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -30,6 +31,7 @@ from factorbus.solver.closures.evidence import (
     ClosureNumbers,
     exact_weights_without,
     numbers_without,
+    odds_of_weights,
     odds_without,
     weights_without,
 )
@@ -70,6 +72,16 @@ class ClosureJudge:
         self.policy = policy or ClosurePolicy()
         self.limits = {dims: limits_of(self.policy, dims) for dims in (_PLANE_DIM, _SPACE_DIM)}
 
+    def looks(
+        self, solver: Callable[[], Solver], ledgers: ClosureLedger, new: Sequence[Closure]
+    ) -> Iterator[ClosureVerdicts]:
+        """What it says behind an insert with `new`, each once that before is applied.  Raises SolverError."""
+        for kind in dict.fromkeys(c.factor.kind for c in new):
+            while (verdicts := self.look(solver(), ledgers, kind)) is not None:
+                yield verdicts
+            if (verdicts := self.look_back(solver(), ledgers, kind)) is not None:
+                yield verdicts
+
     def look(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
         """Judge new ones of a kind, the oldest where there are many, and after a look that moved any, or with new ones,
         suspects that may be believed now; None: there are none.  Raises SolverError.
@@ -79,7 +91,7 @@ class ClosureJudge:
         if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: len(ledger.closures)].any():
             return None
         looked_at, settled = self._revisited(solver, ledgers, ledger, new)
-        alone = [_as_suspect(ledger.closures[row], IMPROBABLE) for row in settled.tolist()]
+        alone = self._improbable(solver, ledger, settled)
         if not looked_at.size:
             return verdicts_of(alone) if alone else None
         chosen = self._chosen(solver, ledger, looked_at)
@@ -145,7 +157,7 @@ class ClosureJudge:
             is_improbable = ledger.is_improbable[among]
             companions = self._companions(solver, ledger, new, np.ascontiguousarray(among[is_improbable][::-1]))
             if companions.size + new.size < LEAST_RIVALS:
-                is_settled = np.array([ledger.closures[row].distance > out for row in new.tolist()])
+                is_settled = residuals_weighed(solver, ledger, new) > out  # NaN where nothing was foreseen
                 settled, picked = new[is_settled], new[~is_settled]
             if picked.size:
                 unsure = among[~is_improbable][-_NEWEST:][::-1]
@@ -157,6 +169,16 @@ class ClosureJudge:
             longest = left[np.argsort(ledger.looked[left], kind="stable")]
             picked = np.concatenate([picked, longest[: max(most + new.size - picked.size, 0)]])
         return np.sort(picked), settled
+
+    def _improbable(self, solver: Solver, ledger: Ledger, rows: I64) -> list[_Row]:
+        """New ones that are improbable by their bounds."""
+        if not rows.size:
+            return []
+        distance = residuals_weighed(solver, ledger, rows)
+        chance = odds_of_weights(ledger.bound[rows], distance, self.limits[ledger.dim].spread)
+        closures = [ledger.closures[row] for row in rows.tolist()]
+        columns = zip(closures, distance.tolist(), chance.tolist(), strict=True)
+        return [(c, SUSPECT, IMPROBABLE, d2, p, c.tried) for c, d2, p in columns]
 
     def _of_many_places(self, solver: Solver, ledger: Ledger, unsure: I64) -> I64:
         """Half as many as may be looked at again, those first of whose place few have come before."""
@@ -248,10 +270,6 @@ class ClosureJudge:
 def _believes(chosen: Chosen) -> bool:
     """Whether any is believed."""
     return any(reason in _BELIEVED for reason in chosen.reasons)
-
-
-def _as_suspect(c: Closure, reason: str) -> _Row:
-    return c, SUSPECT, reason, c.distance, c.chance, c.tried
 
 
 def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:

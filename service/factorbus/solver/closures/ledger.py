@@ -91,6 +91,10 @@ class ClosureVerdicts(NamedTuple):
     tried: I64
 
 
+_NONE: I64 = np.empty(0, np.int64)
+NO_VERDICTS = ClosureVerdicts(_NONE, (), (), np.empty(0), np.empty(0), _NONE)
+
+
 class Ledger:
     """Closures of one kind.
 
@@ -124,7 +128,8 @@ class Ledger:
         """Several more, of which these columns are known."""
         n, count = len(self.closures), len(self.closures) + len(new)
         self._make_room(count)
-        self.ends[n:count], self.looked[n:count] = ends, looked
+        self.ends[n:count] = ends
+        self.looked[n:count] = [looked + (closure.state == ACCEPTED) for closure in new]
         self.z[n:count], self.noise[n:count], self.bound[n:count] = z, noise, bound
         for row, closure in enumerate(new, n):
             closure.row = row
@@ -208,8 +213,11 @@ class ClosureLedger:
         return closure
 
     def enter(self, kind: str, new: Sequence[Closure], ends: I64, z: F64, noise: F64, bound: F64) -> None:
-        """New ones of a kind, with their columns."""
+        """New ones of a kind, with their columns; of those that are in that is a look."""
         self.of_kind[kind].enter(new, ends, self.looks, z, noise, bound)
+        if any(closure.is_in for closure in new):
+            self.looks += 1
+            self.moved_at = self.looks
         self.of_factor |= {closure.factor_id: closure for closure in new}
         for closure in new:
             self._counts[closure.state] += 1
@@ -239,11 +247,11 @@ class ClosureLedger:
         return verdicts_of(rows)
 
     def note(self, verdicts: ClosureVerdicts, revision: int) -> list[Closure]:
-        """They are so from now on; gives those whose state is another than before.  Raises NotAClosure."""
+        """They are so from now on; gives those whose state is another, and new ones.  Raises NotAClosure."""
         self.looks += 1
         changed, moved, lost = [], False, False
         for k, c in enumerate(self.named(verdicts.factors.tolist())):
-            was, ledger = (c.state, c.is_in), self.of_kind[c.factor.kind]
+            was, is_new, ledger = (c.state, c.is_in), c.reason == NEW, self.of_kind[c.factor.kind]
             c.state, c.reason, c.tried = verdicts.states[k], verdicts.reasons[k], int(verdicts.tried[k])
             c.distance, c.chance = float(verdicts.distance[k]), float(verdicts.chance[k])
             ledger.looked[c.row] = self.looks
@@ -252,6 +260,7 @@ class ClosureLedger:
                 self._counts[was[0]] -= 1
                 self._counts[c.state] += 1
                 c.changed = revision
+            if c.state != was[0] or is_new:
                 changed.append(c)
             moved, lost = moved or c.is_in != was[1], lost or (was[1] and not c.is_in)
         if moved:
