@@ -4,6 +4,7 @@ A map with the policy `test` has a state for each closure.  Its verdicts are ent
 `JUDGE`: a name that no client on the bus can have.  Readers raise BadMessage, TooLarge.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -72,6 +73,11 @@ class Suspects:
     chance: F64 = field(default_factory=lambda: np.empty(0))
     came: I64 = field(default_factory=lambda: np.empty(0, np.int64))
     changed: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+
+
+def count_inserts(entries: Iterable[Any]) -> int:
+    """How many of the entries of a record are inserts of clients; the others are verdicts."""
+    return sum(entry.client != JUDGE for entry in entries)
 
 
 def encode_closure_entry(message: ClosureEntry) -> bytes:
