@@ -39,7 +39,8 @@ def health(more: dict[str, Any]) -> dict[str, Any]:
     row |= {name: {"x": 1} for name in ("strategies", "inserts", "refusals", "bytes")}
     return {
         "service": "s", "version": "1", "uptime_s": 1.0, "alive": True, "ready": True, "silent_s": {"watch": 0.0},
-        "memory": {"resident_bytes": 1, "limit_bytes": 2}, "maps": [row | {"journal": {"bytes": 3, "blocked": 0}} | more],
+        "memory": {"resident_bytes": 1, "limit_bytes": 2},
+        "maps": [row | {"journal": {"bytes": 3, "blocked": 0}} | more],
         "workers": [{"name": "w", "slots": 1, "in_flight": 0, "latency_ms": 0.2}],
         "cores": {"used": 2, "pieces": 7}, "disk": {"free_bytes": 3, "size_bytes": 4},
     }  # fmt: skip

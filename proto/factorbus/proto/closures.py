@@ -22,7 +22,7 @@ JUDGE = "closures.judge"
 CLOSURE_POLICIES = ("trust", "test")
 CLOSURE_STATES = ("accepted", "suspect", "rejected", "restored")
 # Why a state is what it is.
-CLOSURE_REASONS = ("new", "passed", "agrees", "unsure", "improbable", "contradicted", "failed", "user")
+CLOSURE_REASONS = ("new", "passed", "agrees", "unsure", "improbable", "rival", "contradicted", "failed", "user")
 
 
 @dataclass(frozen=True, slots=True)

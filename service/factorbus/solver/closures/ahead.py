@@ -79,7 +79,7 @@ def stage_with_believed(
     if foreseen is None:
         believed = np.isin(first + split.closing_at, () if given is None else given.factors).tolist()
     else:
-        gate, most = judge.limits[3].gate, judge.policy.closure_chance_max / ledgers.of_kind[_PLANE].odds()
+        gate, most = judge.limits[3].gate, judge.policy.closure_chance_max / ledgers.of_kind[_PLANE].odds().false
         believed = [d2 <= gate and p <= most for d2, p in zip(foreseen.distance, foreseen.chance, strict=True)]
     staged = StagedBatch(split, first, row, believed, foreseen, given)
     if not all(believed):

@@ -4,13 +4,15 @@
     agrees       one of a set that agrees, as false ones do not by chance (below)
     unsure       within the gate, and may well be false
     improbable   outside the gate
+    rival        that too, and others agree with it: they are one mistake, or the map is wrong
 
 How likely it is that one is false follows from the odds of its residual, times those of closures to be false at all.
 
 A set is the largest of which each two agree.  Chance is excluded twice.  Among n independent false closures, off by up
 to the policy's spread, C(n, m) Π p sets like it are expected: p the odds of one that agrees with one before it, over
 the tree of the least likely agreements.  And mistakes bring several closures with them, as two corridors that look
-alike do, and lead anywhere in the map: of n places C(n, m) q Π p agree, q the odds of the first one.
+alike do, and lead anywhere in the map: of n places C(n, m) q Π p agree, q the odds of the first one, times those of
+such mistakes.
 """
 
 import math
@@ -25,10 +27,17 @@ from factorbus.solver.closures.policy import ClosurePolicy
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.kernels.jit.compile import F64, I64
 
-PASSED, AGREES, UNSURE, IMPROBABLE = "passed", "agrees", "unsure", "improbable"
+PASSED, AGREES, UNSURE, IMPROBABLE, RIVAL = "passed", "agrees", "unsure", "improbable", "rival"
 LEAST_RIVALS = 3  # that agree, against what the map says
 _LEAST_CHANCE = 1e-12
 _MOST_BRANCHES = 20_000
+
+
+class ClosureOdds(NamedTuple):
+    """Before anything is known of it.  false: of a closure to be false; mistaken: of several at one place to be."""
+
+    false: float = 1.0
+    mistaken: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,20 +56,29 @@ class Chosen:
     allowed: F64
 
 
-def choose_closures(c: ClosureNumbers, extent_m: float, policy: ClosurePolicy, odds: float = 1.0) -> Chosen:
-    """Judge `c`; extent_m: half the length of the map, where mistakes may lead; odds: of a closure to be false."""
+def choose_closures(
+    c: ClosureNumbers, extent_m: float, policy: ClosurePolicy, odds: ClosureOdds, all_together: bool = False
+) -> Chosen:
+    """Judge `c`; extent_m: half the length of the map, where mistakes may lead.
+
+    all_together: sets are of those that pass by themselves, too, so that all have the odds of their set.
+    """
     gate, out, own = limits_of(policy, c.noise.shape[1])
     spreads = (own, FalseSpread(max(extent_m, own.metres), math.pi))
     each = judge_each(c, spreads)
     within = each.distance <= gate
-    sure = within & (odds * each.chance[:, 0] <= policy.closure_chance_max)
+    sure = within & (odds.false * each.chance[:, 0] <= policy.closure_chance_max)
     reasons = [PASSED if s else UNSURE if w else IMPROBABLE for s, w in zip(sure, within, strict=True)]
     sets = _Sets(c, gate, spreads, policy)
-    members, of_set = sets.believed(np.flatnonzero(~sure & (each.distance <= out)), odds * each.chance[:, 1])
+    among = np.flatnonzero((~sure | all_together) & (each.distance <= out))
+    members, of_set = sets.believed(among, odds.mistaken * each.chance[:, 1])
     chance = each.chance[:, 0].copy()
     for k in members:
-        reasons[k], chance[k] = AGREES, min(of_set, chance[k])
-    return Chosen(reasons, each.distance, chance, sets.rivals(np.flatnonzero(~within)), each.allowed)
+        reasons[k], chance[k] = reasons[k] if sure[k] else AGREES, min(of_set, chance[k])
+    rivals = sets.rivals(np.flatnonzero(~within))
+    for k in rivals:
+        reasons[k] = RIVAL if reasons[k] == IMPROBABLE else reasons[k]
+    return Chosen(reasons, each.distance, chance, rivals, each.allowed)
 
 
 class ClosureLimits(NamedTuple):

@@ -130,10 +130,10 @@ class ClosureJudge:
         found = ledger.closures[row.item()]
         return verdicts_of([(found, SUSPECT, CONTRADICTED, distance, found.chance, found.tried)])
 
-    def _chosen(self, solver: Solver, ledger: Ledger, rows: I64) -> Chosen:
+    def _chosen(self, solver: Solver, ledger: Ledger, rows: I64, all_together: bool = False) -> Chosen:
         """Among rows."""
         extent = self._extent(solver, ledger)
-        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds())
+        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds(), all_together)
 
     def _extent(self, solver: Solver, ledger: Ledger) -> float:
         """Half the length of the map: mistakes may lead to wherever it has poses."""
@@ -223,7 +223,7 @@ class ClosureJudge:
             without = without_factors(solver, [c.factor_id for c in on_trial])
         except SolverError:
             return stay  # the map does not stand without them
-        chosen = self._chosen(without, ledger, rivals)
+        chosen = self._chosen(without, ledger, rivals, True)
         believed = np.array([reason in _BELIEVED for reason in chosen.reasons])
         numbers = closure_numbers(without, ledger, rivals[believed], False)
         places = np.unique(closure_places(numbers, within)).size if believed.any() else 0
@@ -247,15 +247,20 @@ class ClosureJudge:
         return [ledger.closures[row] for row in tested[near[0] & near[1]].tolist()], 1.0, []
 
     def _least_sure(self, solver: Solver, ledger: Ledger, untried: I64) -> tuple[list[Closure], float, list[_Row]]:
-        """The one that is least sure by all the others, and its odds; and the rest that may have been, with theirs."""
+        """The one that is least sure by all the others, and its odds; and the rest that may have been, with theirs.
+
+        Of one that nothing else holds these are what they were when it came.
+        """
         if ledger.dim != _PLANE_DIM:
             return [], 1.0, []
         least = self.policy.closure_sets_max
         chance = np.array([ledger.closures[row].chance for row in untried.tolist()])
-        unsure = untried[np.argsort(-chance, kind="stable")][: min(_WORST, np.count_nonzero(chance > least))]
+        order = np.argsort(-chance, kind="stable")[: min(_WORST, np.count_nonzero(chance > least))]
+        unsure = untried[order]
         if not unsure.size:
             return [], 1.0, []
         odds = odds_without(closure_numbers(solver, ledger, unsure), self.limits[ledger.dim].spread)
+        odds = np.where(np.isnan(odds), chance[order], odds)
         closures = [ledger.closures[row] for row in unsure.tolist()]
         worst = int(odds.argmax())
         on_trial = [closures[worst]] if odds[worst] > least else []
