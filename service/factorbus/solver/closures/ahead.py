@@ -79,8 +79,11 @@ def stage_with_believed(
     if foreseen is None:
         believed = np.isin(first + split.closing_at, () if given is None else given.factors).tolist()
     else:
-        gate, most = judge.limits[3].gate, judge.policy.closure_chance_max / ledgers.of_kind[_PLANE].odds().false
+        gate, out, _ = judge.limits[3]
+        most = judge.policy.closure_chance_max / ledgers.of_kind[_PLANE].odds().false
         believed = [d2 <= gate and p <= most for d2, p in zip(foreseen.distance, foreseen.chance, strict=True)]
+        if any(d2 <= out and not is_in for d2, is_in in zip(foreseen.distance, believed, strict=True)):
+            believed = [False] * len(believed)  # it may speak against the others: they are judged together
     staged = StagedBatch(split, first, row, believed, foreseen, given)
     if not all(believed):
         graph.forget(before)

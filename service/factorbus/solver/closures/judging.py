@@ -185,7 +185,7 @@ class ClosureJudge:
         most = self.policy.closure_revisits // 2
         if unsure.size <= most:
             return unsure
-        places = closure_places(closure_numbers(solver, ledger, unsure, False), self.policy.closure_place_m)
+        places = _places(closure_numbers(solver, ledger, unsure, False), self.policy)
         before = [int((places[:k] == places[k]).sum()) for k in range(unsure.size)]
         return unsure[np.argsort(before, kind="stable")][:most]
 
@@ -206,8 +206,7 @@ class ClosureJudge:
         the least sure closure, if that is not sure by all others that are in.
         """
         newest = int(np.sort([ledger.closures[row].factor_id for row in rivals.tolist()])[-_RETRY])
-        numbers, within = closure_numbers(solver, ledger, rivals, False), self.policy.closure_place_m
-        several = np.unique(closure_places(numbers, within)).size > 1
+        several = np.unique(_places(closure_numbers(solver, ledger, rivals, False), self.policy)).size > 1
         untried = np.array([row for row in ledger.tested().tolist() if ledger.closures[row].tried < newest], np.int64)
         find = self._least_sure_place if several else self._least_sure
         on_trial, odds, stay = find(solver, ledger, untried)
@@ -226,7 +225,7 @@ class ClosureJudge:
         chosen = self._chosen(without, ledger, rivals, True)
         believed = np.array([reason in _BELIEVED for reason in chosen.reasons])
         numbers = closure_numbers(without, ledger, rivals[believed], False)
-        places = np.unique(closure_places(numbers, within)).size if believed.any() else 0
+        places = np.unique(_places(numbers, self.policy)).size if believed.any() else 0
         is_more_likely = places > 0 and chosen.chance[believed].min() <= self.policy.closure_chance_max * odds
         if not (places > 1 if several else is_more_likely):
             return stay
@@ -275,6 +274,10 @@ class ClosureJudge:
 def _believes(chosen: Chosen) -> bool:
     """Whether any is believed."""
     return any(reason in _BELIEVED for reason in chosen.reasons)
+
+
+def _places(numbers: ClosureNumbers, policy: ClosurePolicy) -> I64:
+    return closure_places(numbers.a, numbers.b, policy.closure_place_m)
 
 
 def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:

@@ -22,6 +22,7 @@ CLOSURE_STATES: tuple[str, ...] = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 BELIEVED = {ACCEPTED, RESTORED}
+_BURST = 10  # closures that one mistake brings
 _COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_new", "is_tested", "is_improbable", "is_rival")
 
 
@@ -173,8 +174,8 @@ class Ledger:
 
         Improbable ones count as false, those that are in as right; as mistakes that bring several at one place, rivals.
         """
-        right = 1 + self.accepted
-        return ClosureOdds(min((1 + self.improbable) / right, 1.0), min((1 + self.rivals) / right, 1.0))
+        false, mistaken = (1 + self.improbable) / (1 + self.accepted), (_BURST + self.rivals) / (_BURST + self.accepted)
+        return ClosureOdds(min(false, 1.0), min(mistaken, 1.0))
 
     def suspects(self) -> I64:
         """Rows."""
