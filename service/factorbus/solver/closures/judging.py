@@ -60,6 +60,7 @@ _BELIEVED = {PASSED, AGREES}
 _PLANE_DIM, _SPACE_DIM = 3, 6
 _WORST = 4  # accepted ones whose d² is computed in a step
 _TOGETHER = 64  # new closures that are judged together: each two of them are compared
+_LOOK_BACK_EVERY = 8  # looks
 _RETRY = 2  # rivals that have to be new before the same closures are tried again
 
 _Row: TypeAlias = tuple[Closure, str, str, float, float, int]
@@ -75,11 +76,15 @@ class ClosureJudge:
     def looks(
         self, solver: Callable[[], Solver], ledgers: ClosureLedger, new: Sequence[Closure]
     ) -> Iterator[ClosureVerdicts]:
-        """What it says behind an insert with `new`, each once that before is applied.  Raises SolverError."""
+        """What it says behind an insert with `new`, each once that before is applied.  Raises SolverError.
+
+        Where the map expected all of them, what it has is seldom contradicted: that is looked at now and then.
+        """
+        looks_back = not all(c.is_in for c in new) or ledgers.looks % _LOOK_BACK_EVERY == 0
         for kind in dict.fromkeys(c.factor.kind for c in new):
             while (verdicts := self.look(solver(), ledgers, kind)) is not None:
                 yield verdicts
-            if (verdicts := self.look_back(solver(), ledgers, kind)) is not None:
+            if looks_back and (verdicts := self.look_back(solver(), ledgers, kind)) is not None:
                 yield verdicts
 
     def look(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
@@ -87,6 +92,8 @@ class ClosureJudge:
         suspects that may be believed now; None: there are none.  Raises SolverError.
         """
         ledger = ledgers.of_kind[kind]
+        if not ledgers.counts()[SUSPECT]:
+            return None
         new = ledger.unjudged()[:_TOGETHER]
         if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: len(ledger.closures)].any():
             return None
