@@ -28,16 +28,17 @@ PATIENCE_S = 60.0
 class End:
     """A map with its journal, as one service has it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, closures: str = "trust") -> None:
         config = Config(journal=str(folder), warm=False)
         library = open_library(config, log_owner, threading.Event())
         assert isinstance(library, Library)
         self.library, self.folder = library, folder / "m"
-        kept = library.open("m", Limits()) if library.has("m") else library.make("m", "bayes-tree", Limits())
-        core = MapCore("m", kept.header.mode, kept.header.epoch, Limits(), 0.0)
+        kept = library.open("m", Limits()) if library.has("m") else library.make("m", "bayes-tree", Limits(), closures)
+        core = MapCore("m", kept.header.mode, kept.header.epoch, Limits(), 0.0, closures)
         kept.restore(core)
         self.told: queue.SimpleQueue[Effect] = queue.SimpleQueue()
         self.deltas: list[Delta] = []
+        self.events: list[dict[str, Any]] = []
         self.numbers: dict[str, int] = {}
         self.solver = kept.map_solver
         self.host = Host(core, kept.map_solver, self._take, self._take, _no_reads, threading.Lock(), _no_both, kept)
@@ -101,6 +102,8 @@ class End:
         for effect in effects:
             if isinstance(effect, Publish) and effect.channel == "delta":
                 self.deltas.append(codec.decode_delta(effect.message))
+            elif isinstance(effect, Publish):
+                self.events.append(codec.decode_map(effect.message))
             elif isinstance(effect, Answer | Refuse):
                 self.told.put(effect)
             elif type(effect).__name__ == "Drained":

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,19 +32,24 @@ _NUMBERS = [
 ]
 
 
-def known() -> set[str]:
-    """Every metric that a service with one map and one worker has, as Prometheus names it."""
+def health(more: dict[str, Any]) -> dict[str, Any]:
+    """Of a service with one map, whose row has `more`, and one worker."""
     row = dict.fromkeys([*_NUMBERS, "steps", "solver_cpu_s"], 1)
     row |= {"name": "m", "step_s": Histogram().as_dict(), "insert_s": Histogram().as_dict()}
     row |= {name: {"x": 1} for name in ("strategies", "inserts", "refusals", "bytes")}
-    health = {
+    return {
         "service": "s", "version": "1", "uptime_s": 1.0, "alive": True, "ready": True, "silent_s": {"watch": 0.0},
-        "memory": {"resident_bytes": 1, "limit_bytes": 2}, "maps": [row | {"journal": {"bytes": 3, "blocked": 0}}],
+        "memory": {"resident_bytes": 1, "limit_bytes": 2},
+        "maps": [row | {"journal": {"bytes": 3, "blocked": 0}} | more],
         "workers": [{"name": "w", "slots": 1, "in_flight": 0, "latency_ms": 0.2}],
         "cores": {"used": 2, "pieces": 7}, "disk": {"free_bytes": 3, "size_bytes": 4},
     }  # fmt: skip
+
+
+def known() -> set[str]:
+    """Every metric that it has, as Prometheus names it."""
     names = set()
-    for family in families(health):
+    for family in families(health({})):
         ends = {"counter": ("_total",), "histogram": ("_bucket", "_sum", "_count")}.get(family.kind, ("",))
         names |= {f"factorbus_{family.name}{end}" for end in ends}
     return names
@@ -58,6 +64,14 @@ def test_dashboards_and_alerts_ask_for_metrics_there_are(file: str) -> None:
 
 def test_another_part_of_the_service_can_add_numbers() -> None:
     assert "factorbus_map_journal_bytes" in known()
+
+
+def test_closures_are_counted_by_state_of_maps_that_test_theirs() -> None:
+    states = {"accepted": 7, "suspect": 2, "rejected": 1, "restored": 0}
+    found = [family for family in families(health({"closure_states": states})) if family.name == "map_closures"]
+    assert [(family.kind, family.labels) for family in found] == [("gauge", ("map", "state"))]
+    assert found[0].samples == [(("m", state), count) for state, count in states.items()]
+    assert all(not family.samples for family in families(health({})) if family.name == "map_closures")
 
 
 def test_the_dashboard_is_one() -> None:

@@ -33,6 +33,11 @@ def messages() -> dict[str, bytes]:
             np.array([-1]),
         )
     )
+    believed = encode_closure_entry(
+        ClosureEntry(
+            2, np.array([4]), ("accepted",), ("passed",), np.array([1.5]), np.array([0.015625]), np.array([-1]), True
+        )
+    )
     found = Suspects(
         _EPOCH, 4, "test", {"accepted": 0, "suspect": 1, "rejected": 0, "restored": 0}, np.array([_FALSE]),
         np.array([[x[0], x[3]]]), ("between_se2",), ("suspect",), ("improbable",), np.array([81.25]),
@@ -46,6 +51,7 @@ def messages() -> dict[str, bytes]:
         "suspects": encode_suspects(found),
         "suspects_none": encode_suspects(Suspects(_EPOCH, 4, "trust")),
         "closure_entry": judged,
+        "closure_entry_ahead": believed,
         "insert_overrides": codec.encode_insert(Insert(7, Batch(), epoch=_EPOCH, changes=said)),
         "insert_trusted": codec.encode_insert(Insert(8, Batch(factors=(edge,)), epoch=_EPOCH)),
         "event_closures": codec.encode_map(

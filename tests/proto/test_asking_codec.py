@@ -36,6 +36,7 @@ CODECS: dict[str, tuple[Callable[[Any], bytes], Callable[[bytes], Any]]] = {
     "ask_suspects": (closures.encode_ask_suspects, closures.decode_ask_suspects),
     "suspects": (closures.encode_suspects, closures.decode_suspects),
     "closure_entry": (closures.encode_closure_entry, closures.decode_closure_entry),
+    "closure_entry_ahead": (closures.encode_closure_entry, closures.decode_closure_entry),
 }
 VECTORS = sorted(name for name in GOLDEN if any(name.startswith(known) for known in CODECS))
 

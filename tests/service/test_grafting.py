@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from journal_ends import End, bits, drive, pose
+from tested_maps import between, corridor, right
 
 from factorbus.client import Draft
 from factorbus.journal.problems import JournalFailed
 from factorbus.journal.records import ACCEPTED
+from factorbus.journal.store import open_store
+from factorbus.proto.closures import JUDGE
 from factorbus.proto.messages import Accepted, Batch, Change
 from factorbus.proto.problems import Problem
 from factorbus.proto.records import JournalPlace
@@ -21,8 +24,8 @@ def ends(tmp_path: Path) -> Iterator[Callable[[str], End]]:
     """Ends by name; closed, and their journals checked, at the end."""
     made: list[End] = []
 
-    def make(name: str) -> End:
-        made.append(End(tmp_path / name))
+    def make(name: str, closures: str = "trust") -> End:
+        made.append(End(tmp_path / name, closures))
         return made[-1]
 
     yield make
@@ -44,6 +47,52 @@ def test_what_is_pushed_gives_the_same_bits_and_is_taken_once(ends: Callable[[st
     robot.follow(base, JournalPlace())
     assert robot.place() == base.place()
     assert robot.keeper().upstream == base.place()
+
+
+def corridor_with_closures(end: End, length: int) -> None:
+    """There and back; of the closures the second is false."""
+    false = between(2, 2 * length - 1, [3.0, 0.0, 3.14])
+    for batch in [*corridor(length), *(Batch((), (factor,)) for factor in (right(1, length), false, right(3, length)))]:
+        assert isinstance(end.insert("robot", batch), Accepted)
+
+
+def test_verdicts_that_come_with_records_are_told_and_are_no_inserts(ends: Callable[..., End]) -> None:
+    robot, base = ends("robot", "test"), ends("base", "test")
+    corridor_with_closures(robot, 8)
+    own = [event for event in robot.events if event["event"] == "closures"]
+    states = {f: (s, r) for e in own for f, s, r in zip(e["factors"], e["states"], e["reasons"], strict=True)}
+    assert states == {16: ("accepted", "passed"), 17: ("suspect", "improbable"), 18: ("accepted", "passed")}
+    assert [event["factors"] for event in own] == [[16], [17], [18]]
+    robot.push_to(base, JournalPlace())
+    (told,) = [event for event in base.events if event["event"] == "closures"]
+    columns = zip(told["factors"], told["states"], told["reasons"], strict=True)
+    assert {factor: (state, reason) for factor, state, reason in columns} == states
+    assert told["revision"] == base.deltas[-1].revision
+    assert (bits(base), base.solver.closure_counts()) == (bits(robot), robot.solver.closure_counts())
+    assert [entry.client for record in robot.records(17) for entry in record.entries] == ["robot", JUDGE] * 3
+    store = open_store(base.folder, read_only=True)
+    assert (store.counts()["inserts"], store.counts()["clients"]) == (20, 1)
+    store.close()
+    assert robot.keeper().stats()["inserts"] == 20
+
+
+def test_closures_that_are_here_alone_are_no_more_inserts_than_came_and_are_judged_with_the_next(
+    ends: Callable[..., End],
+) -> None:
+    robot, base = ends("robot", "test"), ends("base", "test")
+    corridor_with_closures(robot, 8)
+    robot.push_to(base, JournalPlace())
+    same = base.place()
+    assert isinstance(base.insert("desk", Batch((), (right(5, 8),))), Accepted)
+    assert isinstance(robot.insert("robot", Batch((), (right(6, 8),))), Accepted)
+    robot.events.clear()
+    done = robot.follow(base, same)
+    assert (done.rebased, done.behind) == (1, 1)
+    (told,) = [event for event in robot.events if event["event"] == "closures"]
+    assert (told["factors"], told["states"]) == ([19], ["accepted"])
+    assert robot.solver.closure_counts() == {"accepted": 3, "suspect": 2, "rejected": 0, "restored": 0}
+    assert isinstance(robot.insert("robot", Batch((), (right(7, 8),))), Accepted)
+    assert robot.solver.closure_counts() == {"accepted": 5, "suspect": 1, "rejected": 0, "restored": 0}
 
 
 def test_what_others_wrote_comes_first_and_what_is_here_alone_behind_it(ends: Callable[[str], End]) -> None:

@@ -1,6 +1,6 @@
 """A map that tests its closures: ids, verdicts, what a user says, and the journal, whatever comes in which order."""
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +11,12 @@ from tested_maps import TestedMap, between, corridor, right
 from factorbus.journal.records import ACCEPTED, REFUSED
 from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, JUDGE, ClosureEntry, decode_closure_entry
 from factorbus.proto.messages import Batch, Change, Factors, Variables
-from factorbus.service.core.events import Arrived, Verdict, refusal
-from factorbus.service.solving.apply import MapSolver
-from factorbus.solver.closures import ledger
+from factorbus.solver import Solver
+from factorbus.solver.closures import ahead, ledger
 from factorbus.solver.closures.judging import ClosureJudge, residuals_weighed
+from factorbus.solver.divergence import unstage
 from factorbus.solver.errors import NotFinite
+from factorbus.solver.report import StepReport
 
 LENGTH = 8
 
@@ -91,6 +92,7 @@ def test_a_journal_is_run_again_by_its_verdicts_and_not_by_judging(monkeypatch: 
 
     monkeypatch.setattr(ClosureJudge, "look", judge)
     monkeypatch.setattr(ClosureJudge, "look_back", judge)
+    monkeypatch.setattr(ahead, "_foresee", judge)
     made.kill()
     assert made.states() == {16: "accepted", 17: "suspect"}
 
@@ -167,25 +169,69 @@ def test_a_bad_closure_refuses_its_insert_whole() -> None:
     made.kill()
 
 
+def test_what_the_map_expects_goes_in_with_the_step_of_its_insert() -> None:
+    made = driven()
+    new, odometry = Variables("se2", ids(17)), between(16, 17, [1.0, 0.0, 0.0])
+    revision = made.solver.revision
+    # The first of its factors is a closure that stays out, so that no factor's id is that of its row.
+    (accepted,) = made.insert(Batch((new,), (between(2, 15, [3.0, 0.0, 3.14]), odometry, right(1, LENGTH))))
+    assert (accepted.revision, made.solver.revision) == (revision + 1, revision + 1)
+    assert (accepted.report["new_factors"], accepted.report["closures"], accepted.report["suspects"]) == (2, 2, 1)
+    entries = [decode_closure_entry(entry.message) for entry in made.records[-1].entries if entry.client == JUDGE]
+    assert [(entry.ahead, entry.factors.tolist(), entry.states) for entry in entries] == [
+        (True, [18], ("accepted",)),
+        (False, [16], ("suspect",)),
+    ]
+    assert made.in_graph() == {k: row for k, row in made.ids.items() if k != 16}
+    made.kill()
+    made.kill(made.solver.dump(), len(made.records))
+
+
+def refuse_steps(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    """No step succeeds that has more factors."""
+    step = Solver.step
+
+    def without(self: Solver, *arguments: Any) -> StepReport:
+        if self.factor_count > most:
+            unstage(self)
+            raise NotFinite("a value")
+        return step(self, *arguments)
+
+    monkeypatch.setattr(Solver, "step", without)
+
+
 def test_verdicts_whose_step_fails_leave_suspects(monkeypatch: pytest.MonkeyPatch) -> None:
     made = driven()
-    add = MapSolver._add_together
-
-    def refuse_the_judge(self: MapSolver, inserts: Sequence[Arrived]) -> object:
-        if inserts[0].client == JUDGE:
-            return Verdict((refusal(inserts[0], NotFinite("a value")),)), ()
-        return add(self, inserts)
-
     with monkeypatch.context() as patched:
-        patched.setattr(MapSolver, "_add_together", refuse_the_judge)
+        refuse_steps(patched, 2 * LENGTH)
         (accepted,) = made.insert(Batch((), (right(1, LENGTH),)))
-    assert accepted.report["suspects"] == 1
-    assert (made.states(), made.suspects().reasons) == ({16: "suspect"}, ("failed",))
-    entries = made.records[-1].entries
-    assert [entry.client for entry in entries] == ["robot", JUDGE, JUDGE]
-    assert [entry.outcome for entry in entries] == [ACCEPTED, REFUSED, ACCEPTED]
+        assert accepted.report["suspects"] == 1
+        assert (made.states(), made.suspects().reasons) == ({16: "suspect"}, ("failed",))
+        entries = made.records[-1].entries
+        assert [entry.client for entry in entries] == ["robot", JUDGE, JUDGE, JUDGE]
+        assert [entry.outcome for entry in entries] == [ACCEPTED, REFUSED, REFUSED, ACCEPTED]
+        assert [decode_closure_entry(entry.message).ahead for entry in entries[1:]] == [True, False, False]
+        made.kill()
     made.insert(Batch((), (right(3, LENGTH),)))
     assert made.states() == {16: "accepted", 17: "accepted"}, "it is looked at again"
+
+
+def test_an_insert_that_fails_without_its_closures_too_is_refused_and_so_is_what_was_believed_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = driven()
+    revision, content = made.solver.revision, Batch((Variables("se2", ids(17)),), (between(16, 17, [1.0, 0.0, 0.0]),))
+    with monkeypatch.context() as patched:
+        refuse_steps(patched, 2 * LENGTH)
+        (refused,) = made.insert(content._replace(factors=(right(1, LENGTH), *content.factors)))
+        assert (refused.code, made.solver.revision) == ("not_finite", revision)
+        entries = made.records[-1].entries
+        assert [(entry.client, entry.outcome) for entry in entries] == [("robot", REFUSED), (JUDGE, REFUSED)]
+        made.kill()
+    assert (made.states(), made.in_graph()) == ({}, made.ids)
+    made.insert(content)
+    made.insert(Batch((), (right(1, LENGTH),)))
+    assert made.states() == {17: "accepted"}
 
 
 def test_a_judge_that_fails_keeps_the_insert_and_is_asked_again_with_the_next_closure(
@@ -193,6 +239,7 @@ def test_a_judge_that_fails_keeps_the_insert_and_is_asked_again_with_the_next_cl
 ) -> None:
     made = driven()
     with monkeypatch.context() as patched:
+        patched.setattr(ahead, "_foresee", lambda *_: 1 / 0)
         patched.setattr(ClosureJudge, "look", lambda *_: 1 / 0)
         (accepted,) = made.insert(Batch((), (right(1, LENGTH),)))
     assert (accepted.report["suspects"], made.suspects().reasons) == (1, ("new",))

@@ -184,19 +184,21 @@ def test_the_odds_before_are_even_until_closures_have_been_right() -> None:
     ledgers = ClosureLedger()
     ledger = ledgers.of_kind["between_se2"]
     factor = between(0, 1, [0.0, 0.0, 0.0])
-    assert ledger.odds() == 1.0
+    assert ledger.odds() == (1.0, 1.0)
     for k, (state, reason, wanted) in enumerate(
         [
-            (SUSPECT, "improbable", 1.0), (ACCEPTED, "passed", 1.0), (ACCEPTED, "passed", 2 / 3),
-            (SUSPECT, "unsure", 2 / 3), (ACCEPTED, "agrees", 2 / 4),
+            (SUSPECT, "improbable", (1.0, 1.0)), (ACCEPTED, "passed", (1.0, 10 / 11)),
+            (ACCEPTED, "passed", (2 / 3, 10 / 12)), (SUSPECT, "unsure", (2 / 3, 10 / 12)),
+            (ACCEPTED, "agrees", (2 / 4, 10 / 13)), (SUSPECT, "rival", (3 / 4, 11 / 13)),
         ]
     ):  # fmt: skip
         ledger.add(Closure(k, 0, factor, 0, state, reason), (0, 1), 0)  # pyright: ignore[reportArgumentType]
         assert ledger.odds() == pytest.approx(wanted)
-    first = ledger.closures[0]
-    first.state = ACCEPTED
+    first, last = ledger.closures[0], ledger.closures[-1]
+    first.state = last.state = ACCEPTED
     ledger.mark(first)
-    assert ledger.odds() == pytest.approx(1 / 5)
+    ledger.mark(last)
+    assert ledger.odds() == pytest.approx((1 / 6, 10 / 15))
 
 
 def test_a_motion_without_closures_is_moved_in_space_too() -> None:

@@ -4,6 +4,7 @@ A map with the policy `test` has a state for each closure.  Its verdicts are ent
 `JUDGE`: a name that no client on the bus can have.  Readers raise BadMessage, TooLarge.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,7 +22,7 @@ JUDGE = "closures.judge"
 CLOSURE_POLICIES = ("trust", "test")
 CLOSURE_STATES = ("accepted", "suspect", "rejected", "restored")
 # Why a state is what it is.
-CLOSURE_REASONS = ("new", "passed", "agrees", "unsure", "improbable", "contradicted", "failed", "user")
+CLOSURE_REASONS = ("new", "passed", "agrees", "unsure", "improbable", "rival", "contradicted", "failed", "user")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,7 @@ class ClosureEntry:
     """An entry of a journal: what some closures are from now on.  factors (n,): ids; a state and a reason of each.
 
     distance (n,): d²; chance (n,): the odds that it is false; tried (n,): the newest rival at the last trial, −1:
-    none.
+    none.  ahead: they are believed, and went in with the step of the insert before.
     """
 
     sequence: int
@@ -39,6 +40,7 @@ class ClosureEntry:
     distance: F64
     chance: F64
     tried: I64
+    ahead: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +75,11 @@ class Suspects:
     changed: I64 = field(default_factory=lambda: np.empty(0, np.int64))
 
 
+def count_inserts(entries: Iterable[Any]) -> int:
+    """How many of the entries of a record are inserts of clients; the others are verdicts."""
+    return sum(entry.client != JUDGE for entry in entries)
+
+
 def encode_closure_entry(message: ClosureEntry) -> bytes:
     """The bytes of an entry."""
     return encode_map(
@@ -84,6 +91,7 @@ def encode_closure_entry(message: ClosureEntry) -> bytes:
             "distance": _bytes(message.distance, F8),
             "chance": _bytes(message.chance, F8),
             "tried": _bytes(message.tried, I8),
+            **({"ahead": True} if message.ahead else {}),
         }
     )
 
@@ -100,6 +108,7 @@ def decode_closure_entry(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> 
         _numbers(content, "distance", factors.size),
         _numbers(content, "chance", factors.size),
         _integers(content, "tried", factors.size),
+        fields.flag("", content, "ahead"),
     )
 
 

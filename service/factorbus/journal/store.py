@@ -21,6 +21,7 @@ from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_f
 from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal, NotWritten
 from factorbus.journal.records import Checkpoint, Entry, Epoch, Header, JournalRecord, Last, Maker, Sender
 from factorbus.ownership import private_file
+from factorbus.proto.closures import JUDGE
 
 NAME = "journal.db"
 _SCHEMA = """
@@ -124,9 +125,10 @@ class Store:
         with self._reading():
             (records,) = self._db.execute("SELECT COUNT(*) FROM record").fetchone()
             row = self._db.execute(
-                "SELECT COUNT(*), COUNT(DISTINCT client), SUM(LENGTH(message)) FROM entry"
+                "SELECT SUM(client != :judge), COUNT(DISTINCT NULLIF(client, :judge)), SUM(LENGTH(message)) FROM entry",
+                {"judge": JUDGE},
             ).fetchone()
-        return {"records": records, "inserts": row[0], "clients": row[1], "message_bytes": row[2] or 0}
+        return {"records": records, "inserts": row[0] or 0, "clients": row[1], "message_bytes": row[2] or 0}
 
     def checkpoints(self) -> list[Checkpoint]:
         """The checkpoints that were written, newest first."""

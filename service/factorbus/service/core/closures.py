@@ -1,9 +1,11 @@
 """What a map's core makes of closures that are tested: an event where one's state changes, and verdicts that are no
 client's inserts."""
 
+from collections.abc import Sequence
+
 from factorbus.proto import codec
 from factorbus.proto.closures import JUDGE
-from factorbus.service.core.events import Effect, Outcome, Publish, Verdict
+from factorbus.service.core.events import Effect, MovedClosure, Outcome, Publish, Verdict
 
 
 def asked_outcomes(verdict: Verdict) -> list[Outcome]:
@@ -11,15 +13,14 @@ def asked_outcomes(verdict: Verdict) -> list[Outcome]:
     return [outcome for outcome in verdict.outcomes if outcome.insert.client != JUDGE]
 
 
-def closures_moved(verdict: Verdict, epoch: int) -> list[Effect]:
+def closures_moved(moved: Sequence[MovedClosure], epoch: int, revision: int) -> list[Effect]:
     """The event `closures`, if the state of any is another."""
-    moved = verdict.closures
     if not moved:
         return []
     told = {
         "event": "closures",
         "epoch": epoch,
-        "revision": verdict.revision,
+        "revision": revision,
         "factors": [each.factor for each in moved],
         "states": [each.state for each in moved],
         "reasons": [each.reason for each in moved],

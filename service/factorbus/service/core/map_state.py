@@ -30,6 +30,7 @@ from factorbus.service.core.events import (
     Effect,
     Follow,
     InsertBatch,
+    MovedClosure,
     ParsedInsert,
     Publish,
     Read,
@@ -142,7 +143,7 @@ class MapCore:
 
     def give_verdict(self, verdict: Verdict) -> list[Effect]:
         """The solver's word on some of what it has."""
-        effects, asked = closures_moved(verdict, self.epoch), asked_outcomes(verdict)
+        effects, asked = closures_moved(verdict.closures, self.epoch, verdict.revision), asked_outcomes(verdict)
         self._unanswered -= len(asked)
         for outcome in asked:
             self._unanswered_bytes -= outcome.insert.size
@@ -219,14 +220,14 @@ class MapCore:
         return [Publish("delta", stepped.delta)]
 
     def grafted(
-        self, inserts: Iterable[tuple[str, int, int, object]], steps: Iterable[Stepped], now: float
-    ) -> list[Effect]:
-        """Records of another journal were applied: (client, number, digest, answer) of each insert; the steps made."""
+        self, inserts: Iterable[tuple[str, int, int, object]], steps: Iterable[Stepped],
+        closures: Sequence[MovedClosure], now: float,
+    ) -> list[Effect]:  # fmt: skip
+        """Records of another journal were applied: (client, number, digest, answer) of each insert; what came of it."""
         effects = [effect for i in inserts if i[0] != JUDGE for effect in self._admission.note(*i, now)]
-        for stepped in steps:
-            effects += self.stepped(stepped)
+        effects += [effect for stepped in steps for effect in self.stepped(stepped)]
         self._converging.hold(now)  # who sent them takes further steps, too, and sends those
-        return effects
+        return [*effects, *closures_moved(closures, self.epoch, self.revision)]
 
     def _moved_on(self, revision: int, delta_bytes: int) -> None:
         self.revision = revision

@@ -19,10 +19,10 @@ from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Journal
 from factorbus.journal.rewriting import UpstreamPlace
 from factorbus.journal.store import open_store
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE
+from factorbus.proto.closures import JUDGE, count_inserts
 from factorbus.proto.messages import Insert
 from factorbus.proto.records import JournalPlace, SentInsert, SentRecord
-from factorbus.service.core.events import Stepped
+from factorbus.service.core.events import MovedClosure, Stepped, Verdict
 from factorbus.service.journal.keeping import Keeper
 from factorbus.service.journal.record_problems import FactorsMoved, NumberTaken, RecordsDiffer, RecordsMovedOn
 from factorbus.service.journal.recovery import arrived_again, recover
@@ -60,7 +60,8 @@ class Grafted(NamedTuple):
 
     last: where the journal is.  steps: to be published.  rebased: records that were here alone and are made again.
     refused: inserts that had been accepted here, and why they are not any more.  same_outcomes: as they were told;
-    same_bits: of a replica, the values are the upstream's.  behind: inserts that are here alone.
+    same_bits: of a replica, the values are the upstream's.  behind: inserts that are here alone.  closures: whose state
+    is another.
     """
 
     last: Last
@@ -71,6 +72,7 @@ class Grafted(NamedTuple):
     same_outcomes: bool = True
     same_bits: bool = True
     behind: int = 0
+    closures: tuple[MovedClosure, ...] = ()
 
 
 def graft_records(
@@ -103,7 +105,7 @@ def graft_records(
             ends = store.last_at(after + here) if after + here else Last(0, 0, bytes(16))
             place = UpstreamPlace(*graft.upstream_place)
             keeper.upstream = place
-            behind = sum(len(record.entries) for record in own[here:])
+            behind = sum(count_inserts(record.entries) for record in own[here:])
             return Grafted(last, same_bits=ends.chain == place.chain, behind=behind)
         begin = last if here == len(own) else store.last_at(after + here) if after + here else Last(0, 0, bytes(16))
         if here < len(own):
@@ -145,7 +147,7 @@ def _kept(
     except BaseException:
         reload(at_work.map_solver)
         raise
-    behind = sum(len(record.entries) for record in at_work.records[taken:])
+    behind = sum(count_inserts(record.entries) for record in at_work.records[taken:])
     return at_work.grafted(bool(own))._replace(same_bits=place is None or place.chain == upstream_chain, behind=behind)
 
 
@@ -158,6 +160,7 @@ class _Grafting:
         self._name, self._strict, self._published = name, strict, published
         self._steps: list[Stepped] = []
         self._refused: list[AnsweredInsert] = []
+        self._moved: dict[int, MovedClosure] = {}
         self._same, self._rebased, self._before = True, 0, begin.revision
 
     def take(self, records: Iterable[SentRecord]) -> None:
@@ -206,7 +209,8 @@ class _Grafting:
             told = {"rebased": self._rebased, "rebased_refused": len(self._refused)}
             steps = (self.map_solver.whole_estimate(told),)
         inserts = tuple(_answered(entry) for record in self.records for entry in record.entries)
-        return Grafted(self.last, inserts, steps, self._rebased, tuple(self._refused), self._same)
+        refused, moved = tuple(self._refused), tuple(self._moved.values())
+        return Grafted(self.last, inserts, steps, self._rebased, refused, self._same, closures=moved)
 
     def _is_there(self, entry: Entry, there: dict[tuple[str, int], int]) -> bool:
         digest = there.get((entry.client, entry.sequence))
@@ -225,6 +229,8 @@ class _Grafting:
         self.last = Last(made.number, made.revision, made.chain)
         self.records.append(made)
         self._steps += [event for event in events if isinstance(event, Stepped)]
+        verdicts = [event for event in events if isinstance(event, Verdict)]
+        self._moved |= {moved.factor: moved for verdict in verdicts for moved in verdict.closures}
         return made
 
 

@@ -23,6 +23,7 @@ from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnr
 from factorbus.journal.records import Checkpoint, JournalRecord, Last
 from factorbus.journal.rewriting import UpstreamPlace, note_upstream, rewrite
 from factorbus.journal.store import Store, open_store
+from factorbus.proto.closures import count_inserts
 from factorbus.service.core.events import Arrived, Stepped
 from factorbus.service.journal.checkpoint_plan import CheckpointPlan
 from factorbus.service.journal.items import AfterWriting, HandedBatch, NotedCheckpoint, SolverReloaded
@@ -278,7 +279,7 @@ class Keeper:
         self._commits += 1
         self._commit_s += took
         self._longest_s = max(self._longest_s, took)
-        self._inserts += sum(len(record.entries) for record in records)
+        self._inserts += sum(count_inserts(record.entries) for record in records)
 
     def _drop_until_reloaded(self, batch: list[Any], problem: JournalFailed) -> None:
         """Nothing of what comes before the solver is back where the journal is counts any more."""

@@ -332,7 +332,7 @@ class Host:
                 refused.sequence, refused.client, refused.answer, extra={"map": self.core.name},
             )  # fmt: skip
         with self._lock:
-            effects = self.core.grafted(done.inserts, done.steps, time.monotonic())
+            effects = self.core.grafted(done.inserts, done.steps, done.closures, time.monotonic())
         self._do(effects)
         graft.heard(done)
         place = JournalPlace(done.last.record, done.last.chain)

@@ -163,6 +163,8 @@ def _of_maps(maps: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
         ("insert_seconds", "insert_s", "Time from the arrival of an insert to its step's end"),
     ):
         yield Family(name, "histogram", what, ("map",), [((m,), row[key]) for m, row in rows.items()])
+    states = [((m, s), n) for m, row in rows.items() for s, n in row.get("closure_states", {}).items()]
+    yield Family("map_closures", "gauge", "Loop closures of maps that test theirs", ("map", "state"), states)
     yield from _extra("journal", "map", {m: row.get("journal", {}) for m, row in rows.items()})
 
 

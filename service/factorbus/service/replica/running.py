@@ -18,6 +18,7 @@ from factorbus.journal.records import JournalRecord
 from factorbus.journal.rewriting import UpstreamPlace, upstream_of
 from factorbus.journal.store import open_store
 from factorbus.proto import codec, keys
+from factorbus.proto.closures import count_inserts
 from factorbus.proto.problems import Internal, Problem, Unavailable
 from factorbus.proto.records import (
     MOST_NAMED,
@@ -230,7 +231,7 @@ class Replicas:
             place, last = upstream_of(store), keeper.last
             if place.record > last.record:  # the end of the journal was lost in a crash
                 place = UpstreamPlace(*JournalPlace())
-            behind = sum(len(record.entries) for record in store.records(place.record))
+            behind = sum(count_inserts(record.entries) for record in store.records(place.record))
         except (JournalDamaged, JournalUnreadable) as problem:
             self._cannot_follow(name, problem)
             return
@@ -268,7 +269,7 @@ class Replicas:
         records = [record for record in records if record.number > followed.core.head]
         if not records:
             return  # known since the journal was read
-        followed.behind += sum(len(record.entries) for record in records)
+        followed.behind += sum(count_inserts(record.entries) for record in records)
         followed.tail.wrote(records)
         self._do(followed, followed.core.grew(records[-1].number, time.monotonic()))
 
@@ -317,7 +318,7 @@ class Replicas:
             raise JournalDamaged(folder, f"it ends before record {effect.after.record + 1}, which was written")
         followed.core.sent(effect.number, last.record)
         payload = encode_records_push(RecordsPush(effect.after, records))
-        inserts = sum(len(record.inserts) for record in records)
+        inserts = sum(count_inserts(record.inserts) for record in records)
         key = keys.records_key(followed.host.core.name, self._name)
         self._query(followed, effect.number, key, payload, _Sent(inserts, last.chain))
 

@@ -1,9 +1,10 @@
 """The solver of a map that tests its loop closures, and what becomes of those it does not believe.
 
-    1  an insert with closures is a step by itself: in go what it has besides them, under the ids that all would have
-    2  the judge looks (`solver.closures.judging`); its verdicts are entries of their own behind the insert, as changes
-       of the client `JUDGE`: they are what the journal has, and what is applied when it is run again
-    3  verdicts that move closures are a step, as any change is; then the insert is answered
+    1  an insert with closures is a step by itself: in goes what it has besides them, and those that the map expects
+       (`solver.closures.ahead`), under the ids that all would have
+    2  the judge looks at the others (`solver.closures.judging`).  Verdicts of both are entries of their own behind the
+       insert, of the client `JUDGE`: they are what the journal has, and what is applied when it is run again
+    3  verdicts that move closures then are a step, as any change is; then the insert is answered
 
 A closure that is out keeps its id and is in the ledger alone.  A user's `accept` and `reject` are final.  What an
 insert with changes adds is not tested: a person sends it.
@@ -13,8 +14,9 @@ import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +24,6 @@ from factorbus.proto import codec
 from factorbus.proto.closures import JUDGE, ClosureEntry, Suspects, encode_closure_entry, encode_suspects
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Batch, Change, Insert
-from factorbus.proto.problems import Internal, Problem
 from factorbus.service.config import Limits
 from factorbus.service.core.events import (
     Applied,
@@ -37,28 +38,28 @@ from factorbus.service.core.events import (
 )
 from factorbus.service.kernels.digest import digest
 from factorbus.service.solving.apply import MapSolver
+from factorbus.service.solving.asked import AskedChanges, asked_changes
+from factorbus.solver.closures.ahead import StagedBatch, enter_closures, stage_with_believed
 from factorbus.solver.closures.judging import ClosureJudge
-from factorbus.solver.closures.ledger import REJECTED, RESTORED, Closure, ClosureLedger, ClosureVerdicts, SwitchedOff
-from factorbus.solver.closures.loops import TrustedForest, has_candidates
-from factorbus.solver.closures.switching import ClosureSwitch, add_closures, check_whole, note_switch, planned_switch
-from factorbus.solver.errors import NamedTwice, SolverError
+from factorbus.solver.closures.ledger import NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts
+from factorbus.solver.closures.loops import SplitFactors, TrustedForest, has_candidates
+from factorbus.solver.closures.switching import note_switch, planned_switch
+from factorbus.solver.errors import SolverError
 
 # After these, what hangs together is looked up in the graph again.
 _CUTTING = {"remove_factors", "remove_variables", "marginalize", "fix", "free"}
-_SAYS = {"accept": RESTORED, "reject": REJECTED}
-_NONE = np.empty(0, np.int64)
-_NOBODY = ClosureVerdicts(_NONE, (), (), np.empty(0), np.empty(0), _NONE)
 
 log = logging.getLogger(__name__)
 
 
-class _Asked(NamedTuple):
-    """What a user's insert asks for.  made: the insert that does it.  gone: closures that are removed and were out."""
+@dataclass(slots=True)
+class _Testing:
+    """An insert with closures, under way.  given: which of them go in with it, where that is not to be judged."""
 
-    made: Arrived
-    said: ClosureVerdicts
-    switch: ClosureSwitch
-    gone: set[int]
+    batch: Batch
+    split: SplitFactors
+    given: ClosureVerdicts | None
+    staged: StagedBatch | None = None
 
 
 class TestedMapSolver(MapSolver):
@@ -69,6 +70,7 @@ class TestedMapSolver(MapSolver):
     ) -> None:
         super().__init__(make_solver, epoch, limits, options)
         self._judge, self._replaying = ClosureJudge(), False
+        self._testing: _Testing | None = None
         self._begin_anew()
 
     def _begin_anew(self) -> None:
@@ -105,8 +107,10 @@ class TestedMapSolver(MapSolver):
 
     def apply(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped | Applied]:
         """As of any map; an insert that has what may be a closure is a step by itself, as a change is."""
-        cpu_s, plain = time.thread_time(), list[Arrived]()
-        for insert in inserts:
+        cpu_s, plain, ahead = time.thread_time(), list[Arrived](), None
+        for insert, following in zip_longest(inserts, inserts[1:]):
+            if insert is ahead:
+                continue  # with the insert before
             batch = None if insert.is_change else _batch_of(insert)
             if not insert.is_change and (batch is None or not has_candidates(batch)):
                 plain.append(insert)
@@ -116,7 +120,8 @@ class TestedMapSolver(MapSolver):
             if isinstance(insert.content, ClosureEntry):
                 yield from self._apply_judged(insert, insert.content)
             elif batch is not None:
-                yield from self._insert_tested(insert, batch)
+                ahead = following if following and _is_ahead(following.content) else None
+                yield from self._insert_tested(insert, batch, ahead)
             else:
                 yield from self._change_tested(insert)
         yield from self._add_plain(plain)
@@ -178,67 +183,73 @@ class TestedMapSolver(MapSolver):
                         self._forest.join(batch)
             yield event._replace(closures=self._ledger.counts()) if isinstance(event, Applied) else event
 
-    def _insert_tested(self, insert: Arrived, batch: Batch) -> Iterator[Verdict | Stepped]:
-        """One that may have closures."""
-        content: Any = insert.content
+    def _insert_tested(self, insert: Arrived, batch: Batch, entry: Arrived | None) -> Iterator[Verdict | Stepped]:
+        """One that may have closures; entry: verdicts that were applied with it, when it is run again."""
         split = self._forest.split(batch)
-        try:
-            if split.closing and not self._broken:
-                self._check_room(self._accepted_counts, batch.variable_count, batch.factor_count)
-                self._solver.check_new_kinds(batch)
-                check_whole(self._solver.factor_graph, batch)
-        except (Problem, SolverError) as problem:
-            self._forest.forget()
-            yield Verdict((refusal(insert, problem),))
-            return
-        except Exception:
-            self._forest.forget()
-            reference = self._fault()
-            yield Verdict((Outcome(insert, Internal(reference)),))
-            yield from self._replace_solver(reference)
-            return
-        trusted = Batch(batch.variables, tuple(split.trusted))  # pyright: ignore[reportArgumentType]
-        made = insert._replace(content=Insert(insert.sequence, trusted, content.settle))
-        verdict, steps = self._add_together([made])
-        outcome, report = verdict.outcomes[0]._replace(insert=insert), self._last_report
+        given = _verdicts_of(entry.content) if entry else NO_VERDICTS if self._replaying else None
+        (verdict, steps), staged = self._try_tested(insert, _Testing(batch, split, given))
+        if staged and staged.verdicts().states and not entry:
+            entry = self._entry_of(staged.verdicts(), True)
+        failed = verdict.outcomes[0].answer
+        if entry is not None and isinstance(failed, SolverError):
+            yield from steps
+            (verdict, steps), staged = self._try_tested(insert, _Testing(batch, split, NO_VERDICTS))
+        outcome, report = verdict.outcomes[0], self._last_report
+        behind, new = list[Verdict | Stepped](), list[Closure]()
         if outcome.first_factor < 0:
             self._forest.forget()
-            yield verdict._replace(outcomes=(outcome,))
-            yield from steps
-            return
-        revision, first = self._revision, outcome.first_factor
-        new = add_closures(self._solver.factor_graph, self._ledger, split, first, revision)
-        judged = [] if self._replaying or not new else list(self._judged(dict.fromkeys(c.factor.kind for c in new)))
+        elif staged is not None:
+            new = enter_closures(self._solver, self._ledger, staged, self._revision)
+        if entry is not None:
+            went_in, moved = isinstance(failed, bytes), _moved(c for c in new if c.is_in)
+            behind.append(self._entered(entry, moved) if went_in else Verdict((refusal(entry, failed),)))
         if new:
-            out = [c for c in new if not c.is_in]
-            told = {**report, "closures": len(new), "suspects": len(out)}
-            (answer,) = self._messages.write_answers([(insert.sequence, first)], self._epoch, self._revision, told)
-            outcome = outcome._replace(answer=answer)
-        yield verdict._replace(outcomes=(outcome,))
+            judged = [] if self._replaying else list(self._judged(new))
+            counted = {**report, "closures": len(new), "suspects": sum(not c.is_in for c in new)}
+            number = [(insert.sequence, outcome.first_factor)]
+            (answer,) = self._messages.write_answers(number, self._epoch, self._revision, counted)
+            verdict = verdict._replace(outcomes=(outcome._replace(answer=answer),))
+            steps = [*steps, *judged]
+        yield verdict
+        yield from behind
         yield from steps
-        yield from judged
-        if content.convert_below:
-            yield from self._convert_to_points(content.convert_below)
+        if outcome.first_factor >= 0 and (below := getattr(insert.content, "convert_below", 0.0)):
+            yield from self._convert_to_points(below)
+
+    def _try_tested(self, insert: Arrived, testing: _Testing) -> tuple[Any, StagedBatch | None]:
+        """The step of an insert; what came of it, and what was staged of one with closures."""
+        self._testing = testing if testing.split.closing else None
+        try:
+            return self._add_together([insert]), testing.staged
+        finally:
+            self._testing = None
+
+    def _stage(self, insert: Arrived, counts: tuple[int, int]) -> tuple[int, tuple[int, int]]:
+        """As of any map; closures go in that are believed."""
+        if (testing := self._testing) is None or self._broken:
+            return super()._stage(insert, counts)
+        batch, split = testing.batch, testing.split
+        counts = self._check_room(counts, batch.variable_count, batch.factor_count)
+        self._solver.check_new_kinds(batch)
+        mark = self._solver.factor_graph.mark()
+        try:
+            staged = stage_with_believed(self._solver, self._ledger, batch, split, self._judge, testing.given)
+        except SolverError:
+            raise
+        except Exception:
+            log.exception("closures are not judged ahead of their step: the judge failed")
+            self._solver.factor_graph.forget(mark)
+            staged = stage_with_believed(self._solver, self._ledger, batch, split, self._judge, NO_VERDICTS)
+        testing.staged = staged
+        return staged.first, counts
 
     # ---- verdicts ---------------------------------------------------------------------------------------------------
 
-    def _judged(self, kinds: Iterable[str]) -> Iterator[Verdict | Stepped]:
-        """The judge looks at the new closures of these kinds, and what it says is applied."""
-        for kind in kinds:
-            while (verdicts := self._looked(self._judge.look, kind)) is not None:
-                yield from self._enter_or_keep(verdicts)
-            if (verdicts := self._looked(self._judge.look_back, kind)) is not None:
-                yield from self._enter_or_keep(verdicts)
-
-    def _looked(self, look: Callable[..., ClosureVerdicts | None], kind: str) -> ClosureVerdicts | None:
-        """What the judge says; None: nothing, or it failed."""
-        try:
-            return look(self._solver, self._ledger, kind)
-        except SolverError as problem:
-            log.warning("closures are not judged, and stay as they are: %s", problem)
-        except Exception:
-            log.exception("closures are not judged, and stay as they are: the judge failed")
-        return None
+    def _judged(self, new: Sequence[Closure]) -> Iterator[Verdict | Stepped]:
+        """What the judge says behind an insert with `new` closures is applied; where it fails they stay as they are."""
+        looks = self._judge.looks(lambda: self._solver, self._ledger, new)
+        while (verdicts := _next_look(looks)) is not None:
+            yield from self._enter_or_keep(verdicts)
 
     def _enter_or_keep(self, verdicts: ClosureVerdicts) -> Iterator[Verdict | Stepped]:
         """Apply them; where their step fails, what was to go in are suspects."""
@@ -247,27 +258,34 @@ class TestedMapSolver(MapSolver):
 
     def _enter(self, verdicts: ClosureVerdicts) -> Generator[Verdict | Stepped, None, bool]:
         """Apply them as an entry that comes behind the insert; gives whether they are."""
-        self._entries += 1
-        content = ClosureEntry(self._entries, *verdicts)
-        message = encode_closure_entry(content)
-        return (yield from self._apply_judged(entry_again(message, content), content))
+        entry = self._entry_of(verdicts, False)
+        return (yield from self._apply_judged(entry, entry.content))
 
-    def _apply_judged(self, insert: Arrived, content: ClosureEntry) -> Generator[Verdict | Stepped, None, bool]:
-        verdicts = ClosureVerdicts(*(getattr(content, name) for name in ClosureVerdicts._fields))
+    def _entry_of(self, verdicts: ClosureVerdicts, ahead: bool) -> Arrived:
+        self._entries += 1
+        content = ClosureEntry(self._entries, *verdicts, ahead)
+        return entry_again(encode_closure_entry(content), content)
+
+    def _entered(self, entry: Arrived, moved: tuple[MovedClosure, ...]) -> Verdict:
+        """An entry that no step is made for, or that of its insert."""
+        first = self._solver.factor_graph.next_id
+        (answer,) = self._messages.write_answers([(entry.sequence, first)], self._epoch, self._revision, {})
+        return Verdict((Outcome(entry, answer, first),), self._revision, 1, moved)
+
+    def _apply_judged(self, insert: Arrived, content: Any) -> Generator[Verdict | Stepped, None, bool]:
+        verdicts = _verdicts_of(content)
         try:
             switch = planned_switch(self._ledger, verdicts)
         except SolverError as problem:
             yield Verdict((refusal(insert, problem),))
             return False
         if not (switch.out or switch.into):
-            changed, first = self._ledger.note(verdicts, self._revision), self._solver.factor_graph.next_id
-            number = [(insert.sequence, first)]
-            (answer,) = self._messages.write_answers(number, self._epoch, self._revision, {})
-            yield Verdict((Outcome(insert, answer, first),), self._revision, 1, _moved(changed))
+            changed = self._ledger.note(verdicts, self._revision)
+            yield self._entered(insert, _moved(changed))
             return True
         changes = tuple(Change("remove_factors", removal.factors) for removal in switch.removals)
         batch = Batch((), tuple(switch.additions))  # pyright: ignore[reportArgumentType]
-        asked = _Asked(
+        asked = AskedChanges(
             insert._replace(content=Insert(insert.sequence, batch, changes=changes)), verdicts, switch, set()
         )
         with self._without_limits():
@@ -282,7 +300,7 @@ class TestedMapSolver(MapSolver):
         finally:
             self._limits = limits
 
-    def _carry_out(self, insert: Arrived, asked: _Asked, added: int) -> Generator[Verdict | Stepped, None, bool]:
+    def _carry_out(self, insert: Arrived, asked: AskedChanges, added: int) -> Generator[Verdict | Stepped, None, bool]:
         """Make what is asked for, and note it; gives whether it was accepted.
 
         added: factors beside those that come.
@@ -305,7 +323,7 @@ class TestedMapSolver(MapSolver):
     def _change_tested(self, insert: Arrived) -> Iterator[Verdict | Stepped]:
         content: Any = insert.content
         try:
-            asked = self._asked(insert, content)
+            asked = asked_changes(self._ledger, insert, content)
         except SolverError as problem:
             yield Verdict((refusal(insert, problem),))
             return
@@ -325,33 +343,28 @@ class TestedMapSolver(MapSolver):
                 if (c := self._ledger.of_factor.get(factor)) is not None:
                     self._ledger.of_kind[c.factor.kind].measure(c, graph.factor_named(factor))
 
-    def _asked(self, insert: Arrived, content: Insert) -> _Asked:
-        """What a user's changes come to in this map.  Raises SolverError."""
-        said, left, gone = list[ClosureVerdicts](), list[Change](), set[int]()
-        for change in content.changes:
-            ids = [] if change.factors is None else change.factors.tolist()
-            if change.change in _SAYS:
-                said.append(self._ledger.said(ids, _SAYS[change.change]))
-                continue
-            out = [factor for factor in ids if (c := self._ledger.of_factor.get(factor)) is not None and not c.is_in]
-            if out and change.change != "remove_factors":
-                raise SwitchedOff(change.change, out[0], self._ledger.of_factor[out[0]].state)
-            _check_once(change.change, [*gone, *out])
-            gone |= set(out)
-            if not out or len(out) < len(ids):
-                left.append(change._replace(factors=np.array([i for i in ids if i not in gone])) if out else change)
-        verdicts = _together(said)
-        _check_once("accept, reject and remove_factors", [*verdicts.factors.tolist(), *gone])
-        switch = planned_switch(self._ledger, verdicts)
-        removals = [Change("remove_factors", removal.factors) for removal in switch.removals]
-        batch: Any = content.batch._replace(factors=(*content.batch.factors, *switch.additions))
-        made = content._replace(batch=batch, changes=(*removals, *left))
-        return _Asked(insert._replace(content=made), verdicts, switch, gone)
-
 
 def entry_again(message: bytes, content: ClosureEntry) -> Arrived:
     """Verdicts as an entry, which nobody waits for."""
     return Arrived([], JUDGE, content.sequence, 0, len(message), int(digest(message)), content, 0.0, message)
+
+
+def _next_look(looks: Iterator[ClosureVerdicts]) -> ClosureVerdicts | None:
+    try:
+        return next(looks, None)
+    except SolverError as problem:
+        log.warning("closures are not judged, and stay as they are: %s", problem)
+    except Exception:
+        log.exception("closures are not judged, and stay as they are: the judge failed")
+    return None
+
+
+def _is_ahead(content: object) -> bool:
+    return isinstance(content, ClosureEntry) and content.ahead
+
+
+def _verdicts_of(entry: Any) -> ClosureVerdicts:
+    return ClosureVerdicts(*(getattr(entry, name) for name in ClosureVerdicts._fields))
 
 
 def _batch_of(insert: Arrived) -> Batch | None:
@@ -369,21 +382,3 @@ def _stands(closure: Closure, row: int, graph: Any) -> bool:
 
 def _moved(changed: Iterable[Closure]) -> tuple[MovedClosure, ...]:
     return tuple(MovedClosure(c.factor_id, c.state, c.reason) for c in changed)
-
-
-def _together(said: Sequence[ClosureVerdicts]) -> ClosureVerdicts:
-    if not said:
-        return _NOBODY
-    columns = zip(*said, strict=True)
-    factors, states, reasons, distance, chance, tried = columns
-    return ClosureVerdicts(
-        np.concatenate(factors), sum(states, ()), sum(reasons, ()), np.concatenate(distance), np.concatenate(chance),
-        np.concatenate(tried),
-    )  # fmt: skip
-
-
-def _check_once(what: str, factors: Sequence[int]) -> None:
-    """Raises NamedTwice."""
-    for k, factor in enumerate(factors):
-        if factor in factors[:k]:
-            raise NamedTwice(what, f"factor {factor}", factor=factor)

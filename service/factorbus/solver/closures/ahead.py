@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factorbus.solver.closures.choosing import PASSED, ClosureLimits
+from factorbus.solver.closures.choosing import PASSED
 from factorbus.solver.closures.evidence import volume_of
-from factorbus.solver.closures.ledger import ACCEPTED, NEW, SUSPECT, Closure, ClosureLedger
+from factorbus.solver.closures.judging import ClosureJudge
+from factorbus.solver.closures.ledger import ACCEPTED, NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.closures.loops import SplitFactors
-from factorbus.solver.closures.policy import ClosurePolicy
 from factorbus.solver.graph.factor_graph import Mark
 from factorbus.solver.graph.groups import Addition, BatchLike
 from factorbus.solver.kernels.closures import ahead
@@ -40,6 +40,7 @@ class StagedBatch:
     """A batch that waits for its step, with those of its closures that are believed already.
 
     first: the id of its first factor, were all in; row: where its first row is.  believed: of each closure.
+    given: verdicts that say which are, as somebody who judged had them; None: they follow from `foreseen`.
     """
 
     split: SplitFactors
@@ -47,25 +48,43 @@ class StagedBatch:
     row: int
     believed: Sequence[bool]
     foreseen: Foreseen | None
+    given: ClosureVerdicts | None = None
+
+    def verdicts(self) -> ClosureVerdicts:
+        """On those that are believed."""
+        if self.given is not None or self.foreseen is None:
+            return self.given or NO_VERDICTS
+        which = np.flatnonzero(self.believed)
+        distance, chance = np.array(self.foreseen.distance)[which], np.array(self.foreseen.chance)[which]
+        states, reasons = (ACCEPTED,) * which.size, (PASSED,) * which.size
+        ids = self.first + self.split.closing_at[which]
+        return ClosureVerdicts(ids, states, reasons, distance, chance, np.full(which.size, -1))
 
 
 def stage_with_believed(
-    solver: Solver, ledgers: ClosureLedger, batch: BatchLike, split: SplitFactors, policy: ClosurePolicy,
-    limits: ClosureLimits,
+    solver: Solver, ledgers: ClosureLedger, batch: BatchLike, split: SplitFactors, judge: ClosureJudge,
+    given: ClosureVerdicts | None = None,
 ) -> StagedBatch:  # fmt: skip
-    """Stage `batch`, but for closures that are not believed before its step.  Raises as `stage` does."""
+    """Stage `batch`, but for closures that are not believed before its step.  Raises as `stage` does.
+
+    given: verdicts on those that are, of a batch that was judged before.
+    """
     graph = solver._graph
     before = graph.mark()
     first = solver.stage(batch)
-    row = before[at.FACTORS]
-    rows = graph.rows_of(first + split.closing_at) if graph.counts.item(at.MEMBERS) else row + split.closing_at
-    foreseen = _foresee(solver, split, rows, before, volume_of(limits.spread))
+    row, foreseen = before[at.FACTORS], None
+    if given is None:
+        rows = graph.rows_of(first + split.closing_at) if graph.counts.item(at.MEMBERS) else row + split.closing_at
+        foreseen = _foresee(solver, split, rows, before, volume_of(judge.limits[3].spread))
     if foreseen is None:
-        believed = [False] * len(split.closing)
+        believed = np.isin(first + split.closing_at, () if given is None else given.factors).tolist()
     else:
-        most = policy.closure_chance_max / ledgers.of_kind[_PLANE].odds()
-        believed = [d2 <= limits.gate and p <= most for d2, p in zip(foreseen.distance, foreseen.chance, strict=True)]
-    staged = StagedBatch(split, first, row, believed, foreseen)
+        gate, out, _ = judge.limits[3]
+        most = judge.policy.closure_chance_max / ledgers.of_kind[_PLANE].odds().false
+        believed = [d2 <= gate and p <= most for d2, p in zip(foreseen.distance, foreseen.chance, strict=True)]
+        if any(d2 <= out and not is_in for d2, is_in in zip(foreseen.distance, believed, strict=True)):
+            believed = [False] * len(believed)  # it may speak against the others: they are judged together
+    staged = StagedBatch(split, first, row, believed, foreseen, given)
     if not all(believed):
         graph.forget(before)
         restage(solver, batch, staged)
@@ -81,24 +100,27 @@ def restage(solver: Solver, batch: BatchLike, staged: StagedBatch) -> None:
 def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, revision: int) -> list[Closure]:
     """The step of a batch is made: name its factors as if all were in, and write down its closures; gives those."""
     split, graph, first, seen = staged.split, solver._graph, staged.first, staged.foreseen
-    if not all(staged.believed):
-        places = np.concatenate([split.trusted_at, split.closing_at[np.array(staged.believed)]])
+    is_in = np.array(staged.believed)
+    if not is_in.all():
+        places = np.concatenate([split.trusted_at, split.closing_at[is_in]])
         rows = np.arange(staged.row, graph.counts.item(at.FACTORS))
         graph.rename_last(first + places[graph.ids_of(rows) - first], first + split.count)
     if seen is None:
         placed = zip(split.closing, split.closing_at.tolist(), strict=True)
-        return [ledgers.add(factor, first + place, graph, revision) for factor, place in placed]
-    if any(staged.believed):
-        ledgers.looks += 1
-        ledgers.moved_at = ledgers.looks
-    made, bounds = list[Closure](), seen.numbers[:, ahead.J_BOUND : ahead.J_MEASURED]
-    if not all(staged.believed):
-        out = ~np.array(staged.believed)
-        bounds[out] = np.linalg.inv(seen.numbers[out, ahead.J_ALLOWED : ahead.J_NOISE])
+        added = [ledgers.add(factor, first + place, graph, revision) for factor, place in placed]
+        if is_in.any():
+            ledgers.note(staged.verdicts(), revision)
+        return added
+    bounds = seen.numbers[:, ahead.J_BOUND : ahead.J_MEASURED]
+    if not is_in.all():
+        bounds[~is_in] = np.linalg.inv(seen.numbers[~is_in, ahead.J_ALLOWED : ahead.J_NOISE])
+    made = list[Closure]()
     for k, place in enumerate(split.closing_at.tolist()):
-        state, reason = (ACCEPTED, PASSED) if staged.believed[k] else (SUSPECT, NEW)
-        told = state, reason, seen.distance[k], seen.chance[k], revision
-        made.append(Closure(first + place, 0, split.closing[k], revision, *told))
+        if staged.believed[k]:
+            told = ACCEPTED, PASSED, seen.distance[k], seen.chance[k], revision
+            made.append(Closure(first + place, 0, split.closing[k], revision, *told))
+        else:
+            made.append(Closure(first + place, 0, split.closing[k], revision, changed=revision))
     z, noise = seen.numbers[:, ahead.J_MEASURED :], seen.numbers[:, ahead.J_NOISE : ahead.J_WEIGHT]
     ledgers.enter(_PLANE, made, seen.ends, z, noise, bounds)
     return made

@@ -4,13 +4,15 @@
     agrees       one of a set that agrees, as false ones do not by chance (below)
     unsure       within the gate, and may well be false
     improbable   outside the gate
+    rival        that too, and others agree with it: they are one mistake, or the map is wrong
 
 How likely it is that one is false follows from the odds of its residual, times those of closures to be false at all.
 
 A set is the largest of which each two agree.  Chance is excluded twice.  Among n independent false closures, off by up
 to the policy's spread, C(n, m) Π p sets like it are expected: p the odds of one that agrees with one before it, over
 the tree of the least likely agreements.  And mistakes bring several closures with them, as two corridors that look
-alike do, and lead anywhere in the map: of n places C(n, m) q Π p agree, q the odds of the first one.
+alike do, and lead anywhere in the map: of n places C(n, m) q Π p agree, q the odds of the first one, times those of
+such mistakes.
 """
 
 import math
@@ -25,10 +27,17 @@ from factorbus.solver.closures.policy import ClosurePolicy
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.kernels.jit.compile import F64, I64
 
-PASSED, AGREES, UNSURE, IMPROBABLE = "passed", "agrees", "unsure", "improbable"
+PASSED, AGREES, UNSURE, IMPROBABLE, RIVAL = "passed", "agrees", "unsure", "improbable", "rival"
 LEAST_RIVALS = 3  # that agree, against what the map says
 _LEAST_CHANCE = 1e-12
 _MOST_BRANCHES = 20_000
+
+
+class ClosureOdds(NamedTuple):
+    """Before anything is known of it.  false: of a closure to be false; mistaken: of several at one place to be."""
+
+    false: float = 1.0
+    mistaken: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,20 +56,29 @@ class Chosen:
     allowed: F64
 
 
-def choose_closures(c: ClosureNumbers, extent_m: float, policy: ClosurePolicy, odds: float = 1.0) -> Chosen:
-    """Judge `c`; extent_m: half the length of the map, where mistakes may lead; odds: of a closure to be false."""
+def choose_closures(
+    c: ClosureNumbers, extent_m: float, policy: ClosurePolicy, odds: ClosureOdds, all_together: bool = False
+) -> Chosen:
+    """Judge `c`; extent_m: half the length of the map, where mistakes may lead.
+
+    all_together: sets are of those that pass by themselves, too, so that all have the odds of their set.
+    """
     gate, out, own = limits_of(policy, c.noise.shape[1])
     spreads = (own, FalseSpread(max(extent_m, own.metres), math.pi))
     each = judge_each(c, spreads)
     within = each.distance <= gate
-    sure = within & (odds * each.chance[:, 0] <= policy.closure_chance_max)
+    sure = within & (odds.false * each.chance[:, 0] <= policy.closure_chance_max)
     reasons = [PASSED if s else UNSURE if w else IMPROBABLE for s, w in zip(sure, within, strict=True)]
-    sets = _Sets(c, gate, spreads, policy)
-    members, of_set = sets.believed(np.flatnonzero(~sure & (each.distance <= out)), odds * each.chance[:, 1])
+    sets = _Sets(c, gate, spreads, policy, each.chance[:, 1])
+    among = np.flatnonzero((~sure | all_together) & (each.distance <= out))
+    members, of_set = sets.believed(among, odds.mistaken)
     chance = each.chance[:, 0].copy()
     for k in members:
-        reasons[k], chance[k] = AGREES, min(of_set, chance[k])
-    return Chosen(reasons, each.distance, chance, sets.rivals(np.flatnonzero(~within)), each.allowed)
+        reasons[k], chance[k] = reasons[k] if sure[k] else AGREES, min(of_set, chance[k])
+    rivals = sets.rivals(np.flatnonzero(~within))
+    for k in rivals:
+        reasons[k] = RIVAL if reasons[k] == IMPROBABLE else reasons[k]
+    return Chosen(reasons, each.distance, chance, rivals, each.allowed)
 
 
 class ClosureLimits(NamedTuple):
@@ -82,39 +100,49 @@ def limits_of(policy: ClosurePolicy, dims: int) -> ClosureLimits:
 class _Sets:
     """Sets of closures that agree.
 
-    agree (n, n), chance (n, n, spreads): of each two.  places (n,): a number for each two places closures are between.
+    agree (n, n), chance (n, n, spreads): of each two.  alone (n,): of each, anywhere.
     """
 
-    def __init__(self, c: ClosureNumbers, gate: float, spreads: Sequence[FalseSpread], policy: ClosurePolicy) -> None:
+    def __init__(
+        self, c: ClosureNumbers, gate: float, spreads: Sequence[FalseSpread], policy: ClosurePolicy, alone: F64
+    ) -> None:
         n = len(c.z)
         i, j = np.triu_indices(n, 1)
         pairs = judge_pairs(c, i, j, spreads)
         self.agree, self.chance = np.zeros((n, n), bool), np.ones((n, n, len(spreads)))
         self.agree[i, j] = self.agree[j, i] = pairs.distance <= gate
         self.chance[i, j] = self.chance[j, i] = pairs.chance
-        self.places, self.policy = closure_places(c, policy.closure_place_m), policy
+        self.alone, self.numbers, self.policy = alone, c, policy
 
-    def believed(self, among: I64, alone: F64) -> tuple[list[int], float]:
-        """The largest one among some, or none where it may be chance, and its odds; alone (n,): of each, anywhere.
+    def believed(self, among: I64, odds: float) -> tuple[list[int], float]:
+        """The largest one among some, or none where it may be chance, and its odds; odds: of mistakes.
 
-        Of each member one other says so well where it is that a false one would hardly agree.
+        Of each member one other says so well where it is that a false one would hardly agree, and of each place the map
+        or another place does: the members of one are one mistake, if they are one.
         """
-        members = self._largest(among)
+        members, most = self._largest(among), self.policy.closure_chance_max
         while members.size > 1:
-            sure = self.chance[np.ix_(members, members)][..., 0].min(axis=1) <= self.policy.closure_chance_max
-            if sure.all():
-                break
-            members = members[sure]
-        if members.size < 2:
-            return [], 1.0
-        chance, own = self.chance[np.ix_(members, members)], self.places[members]
-        there = np.unique(own)
-        # Of two places the two that are the least likely to agree.
-        between = np.array([[chance[own == p][:, own == q, 1].min() for q in there] for p in there])
-        logarithm = _chain(between) + math.log(max(float(alone[members].min()), _LEAST_CHANCE))
-        by_mistake = _expected(np.unique(self.places[among]).size, there.size, logarithm)
-        is_sure = self._is_set(members, among.size) and by_mistake <= self.policy.closure_chance_max
-        return (members.tolist(), by_mistake) if is_sure else ([], 1.0)
+            sure = self.chance[np.ix_(members, members)][..., 0].min(axis=1) <= most
+            if not sure.all():
+                members = members[sure]
+                continue
+            # Of members alone: others between them would make two places of one.
+            chance, own = self.chance[np.ix_(members, members)], self._places(members)
+            there, place = np.unique(own, return_inverse=True)
+            alone = np.array([odds * self.alone[members[own == p]].min() for p in there])
+            # Of two places the two that are the least likely to agree.
+            between = np.array([[chance[own == p][:, own == q, 1].min() for q in there] for p in there])
+            np.fill_diagonal(between, np.inf)
+            held = np.minimum(alone, odds * between.min(axis=1)) <= most
+            if not held.all():
+                members = members[held[place]]
+                continue
+            logarithm = _chain(between) + math.log(max(float(alone.min()), _LEAST_CHANCE))
+            count = max(np.unique(self._places(among)).size, there.size)
+            by_mistake = _expected(count, there.size, logarithm)
+            is_sure = self._is_set(members, among.size) and by_mistake <= most
+            return (members.tolist(), by_mistake) if is_sure else ([], 1.0)
+        return [], 1.0
 
     def rivals(self, among: I64) -> list[int]:
         """The largest one among some, three or more, that is not by chance of independent ones."""
@@ -127,6 +155,9 @@ class _Sets:
         """Whether independent false ones, of as many, would hardly agree so."""
         logarithm = _chain(self.chance[np.ix_(members, members)][..., 0])
         return _expected(count, members.size, logarithm) <= self.policy.closure_sets_max
+
+    def _places(self, rows: I64) -> I64:
+        return closure_places(self.numbers.a[rows], self.numbers.b[rows], self.policy.closure_place_m)
 
     def _largest(self, among: I64) -> I64:
         return among[largest_agreeing(self.agree[np.ix_(among, among)])]
@@ -155,10 +186,10 @@ def largest_agreeing(agree: np.ndarray) -> I64:
     return np.array(sorted(best), np.int64)
 
 
-def closure_places(c: ClosureNumbers, within_m: float) -> I64:
+def closure_places(a: F64, b: F64, within_m: float) -> I64:
     """(n,): the first of those before it, or itself, that is between the same two places; it is none of another's."""
-    a, b = (np.linalg.norm(T[:, None, :-1, -1] - T[None, :, :-1, -1], axis=-1) <= within_m for T in (c.a, c.b))
-    same, number = a & b, np.arange(len(c.a))
+    near = [np.linalg.norm(T[:, None, :-1, -1] - T[None, :, :-1, -1], axis=-1) <= within_m for T in (a, b)]
+    same, number = near[0] & near[1], np.arange(len(a))
     for k in range(len(number)):
         first = np.flatnonzero(same[k, : k + 1] & (number[: k + 1] == np.arange(k + 1)))
         number[k] = first[0]

@@ -151,10 +151,20 @@ def numbers_without(c: ClosureNumbers, gone: int) -> ClosureNumbers:
 
 
 def odds_without(c: ClosureNumbers, spread: FalseSpread) -> F64:
-    """p (n,) of closures in the plane that the map has, each against the map without it: S = Ω⁻¹ W Ω⁻¹."""
+    """p (n,) of closures in the plane that the map has, each against the map without it: S = Ω⁻¹ W Ω⁻¹.
+
+    NaN where one alone holds what it measures: the estimate does not say how unsure the map is without it.
+    """
     W, r = weights_without(c), _residuals(c)[1]
-    root = np.sqrt(np.maximum(np.linalg.det(W), 0.0)) * np.linalg.det(c.noise)
+    size = np.linalg.det(W)
+    root = np.sqrt(np.where(size > 0.0, size, np.nan)) * np.linalg.det(c.noise)
     distance = np.einsum("na,nab,nb->n", r, W, r)
+    return _odds(FULL * root * np.exp(0.5 * np.minimum(distance, MOST_DISTANCE)), [spread])[:, 0]
+
+
+def odds_of_weights(W: F64, distance: F64, spread: FalseSpread) -> F64:
+    """p (n,) of closures in the plane with S⁻¹ = W."""
+    root = 1.0 / np.sqrt(np.linalg.det(W))
     return _odds(FULL * root * np.exp(0.5 * np.minimum(distance, MOST_DISTANCE)), [spread])[:, 0]
 
 

@@ -7,7 +7,6 @@
 All of it follows from what was inserted: the same batches give the same verdicts, and the same bits.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from factorbus.solver.changing import try_change, with_changes
@@ -44,7 +43,7 @@ class GatedSolver:
         self.solver, self.judge = Solver(options), ClosureJudge(policy)
         self.ledger = ClosureLedger()
         self._joined = TrustedForest()
-        self._steps, self._limits = 0, self.judge.limits[3]
+        self._steps = 0
 
     @property
     def closures(self) -> list[Closure]:
@@ -59,7 +58,7 @@ class GatedSolver:
         split, staged = self._joined.split(batch), None
         try:
             if split.closing:
-                staged = stage_with_believed(self.solver, self.ledger, batch, split, self.judge.policy, self._limits)
+                staged = stage_with_believed(self.solver, self.ledger, batch, split, self.judge)
             else:
                 self.solver.stage(batch)
             report, staged = self._step(batch, staged)
@@ -83,11 +82,10 @@ class GatedSolver:
     def _judged(self, report: StepReport, staged: StagedBatch) -> GatedReport:
         """The closures of a batch are written down and judged, now that the rest of it is in."""
         new, moved = enter_closures(self.solver, self.ledger, staged, self._steps), dict[int, bool]()
-        for kind in dict.fromkeys(c.factor.kind for c in new):
-            for verdicts in self._looks(kind):
-                for c in self.ledger.named(verdicts.factors.tolist()):
-                    moved.setdefault(c.factor_id, c.is_in)
-                report = self._apply_or_keep(verdicts) or report
+        for verdicts in self.judge.looks(lambda: self.solver, self.ledger, new):
+            for c in self.ledger.named(verdicts.factors.tolist()):
+                moved.setdefault(c.factor_id, c.is_in)
+            report = self._apply_or_keep(verdicts) or report
         if not moved:
             return GatedReport(report, tuple(c for c in new if c.is_in), tuple(c for c in new if not c.is_in))
         for c in new:
@@ -99,13 +97,6 @@ class GatedSolver:
             tuple(c for c in new if not c.is_in),
             tuple(c for c in changed if not c.is_in),
         )
-
-    def _looks(self, kind: str) -> Iterator[ClosureVerdicts]:
-        """What the judge says, each once that before is applied."""
-        while (verdicts := self.judge.look(self.solver, self.ledger, kind)) is not None:
-            yield verdicts
-        if (verdicts := self.judge.look_back(self.solver, self.ledger, kind)) is not None:
-            yield verdicts
 
     def suspects(self) -> list[Closure]:
         """Closures that the estimate does not have, and that may still be believed."""

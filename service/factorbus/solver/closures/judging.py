@@ -12,6 +12,7 @@ trial: they are to stay out if more places' closures are believed then.
 All of it follows from the estimate and the ledger: the same ones give the same verdicts.
 """
 
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -30,6 +31,7 @@ from factorbus.solver.closures.evidence import (
     ClosureNumbers,
     exact_weights_without,
     numbers_without,
+    odds_of_weights,
     odds_without,
     weights_without,
 )
@@ -58,6 +60,7 @@ _BELIEVED = {PASSED, AGREES}
 _PLANE_DIM, _SPACE_DIM = 3, 6
 _WORST = 4  # accepted ones whose d² is computed in a step
 _TOGETHER = 64  # new closures that are judged together: each two of them are compared
+_LOOK_BACK_EVERY = 8  # looks
 _RETRY = 2  # rivals that have to be new before the same closures are tried again
 
 _Row: TypeAlias = tuple[Closure, str, str, float, float, int]
@@ -70,16 +73,32 @@ class ClosureJudge:
         self.policy = policy or ClosurePolicy()
         self.limits = {dims: limits_of(self.policy, dims) for dims in (_PLANE_DIM, _SPACE_DIM)}
 
+    def looks(
+        self, solver: Callable[[], Solver], ledgers: ClosureLedger, new: Sequence[Closure]
+    ) -> Iterator[ClosureVerdicts]:
+        """What it says behind an insert with `new`, each once that before is applied.  Raises SolverError.
+
+        Where the map expected all of them, what it has is seldom contradicted: that is looked at now and then.
+        """
+        looks_back = not all(c.is_in for c in new) or ledgers.looks % _LOOK_BACK_EVERY == 0
+        for kind in dict.fromkeys(c.factor.kind for c in new):
+            while (verdicts := self.look(solver(), ledgers, kind)) is not None:
+                yield verdicts
+            if looks_back and (verdicts := self.look_back(solver(), ledgers, kind)) is not None:
+                yield verdicts
+
     def look(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
         """Judge new ones of a kind, the oldest where there are many, and after a look that moved any, or with new ones,
         suspects that may be believed now; None: there are none.  Raises SolverError.
         """
         ledger = ledgers.of_kind[kind]
+        if not ledgers.counts()[SUSPECT]:
+            return None
         new = ledger.unjudged()[:_TOGETHER]
         if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: len(ledger.closures)].any():
             return None
         looked_at, settled = self._revisited(solver, ledgers, ledger, new)
-        alone = [_as_suspect(ledger.closures[row], IMPROBABLE) for row in settled.tolist()]
+        alone = self._improbable(solver, ledger, settled)
         if not looked_at.size:
             return verdicts_of(alone) if alone else None
         chosen = self._chosen(solver, ledger, looked_at)
@@ -118,10 +137,10 @@ class ClosureJudge:
         found = ledger.closures[row.item()]
         return verdicts_of([(found, SUSPECT, CONTRADICTED, distance, found.chance, found.tried)])
 
-    def _chosen(self, solver: Solver, ledger: Ledger, rows: I64) -> Chosen:
+    def _chosen(self, solver: Solver, ledger: Ledger, rows: I64, all_together: bool = False) -> Chosen:
         """Among rows."""
         extent = self._extent(solver, ledger)
-        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds())
+        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds(), all_together)
 
     def _extent(self, solver: Solver, ledger: Ledger) -> float:
         """Half the length of the map: mistakes may lead to wherever it has poses."""
@@ -145,7 +164,7 @@ class ClosureJudge:
             is_improbable = ledger.is_improbable[among]
             companions = self._companions(solver, ledger, new, np.ascontiguousarray(among[is_improbable][::-1]))
             if companions.size + new.size < LEAST_RIVALS:
-                is_settled = np.array([ledger.closures[row].distance > out for row in new.tolist()])
+                is_settled = residuals_weighed(solver, ledger, new) > out  # NaN where nothing was foreseen
                 settled, picked = new[is_settled], new[~is_settled]
             if picked.size:
                 unsure = among[~is_improbable][-_NEWEST:][::-1]
@@ -158,12 +177,22 @@ class ClosureJudge:
             picked = np.concatenate([picked, longest[: max(most + new.size - picked.size, 0)]])
         return np.sort(picked), settled
 
+    def _improbable(self, solver: Solver, ledger: Ledger, rows: I64) -> list[_Row]:
+        """New ones that are improbable by their bounds."""
+        if not rows.size:
+            return []
+        distance = residuals_weighed(solver, ledger, rows)
+        chance = odds_of_weights(ledger.bound[rows], distance, self.limits[ledger.dim].spread)
+        closures = [ledger.closures[row] for row in rows.tolist()]
+        columns = zip(closures, distance.tolist(), chance.tolist(), strict=True)
+        return [(c, SUSPECT, IMPROBABLE, d2, p, c.tried) for c, d2, p in columns]
+
     def _of_many_places(self, solver: Solver, ledger: Ledger, unsure: I64) -> I64:
         """Half as many as may be looked at again, those first of whose place few have come before."""
         most = self.policy.closure_revisits // 2
         if unsure.size <= most:
             return unsure
-        places = closure_places(closure_numbers(solver, ledger, unsure, False), self.policy.closure_place_m)
+        places = _places(closure_numbers(solver, ledger, unsure, False), self.policy)
         before = [int((places[:k] == places[k]).sum()) for k in range(unsure.size)]
         return unsure[np.argsort(before, kind="stable")][:most]
 
@@ -184,8 +213,7 @@ class ClosureJudge:
         the least sure closure, if that is not sure by all others that are in.
         """
         newest = int(np.sort([ledger.closures[row].factor_id for row in rivals.tolist()])[-_RETRY])
-        numbers, within = closure_numbers(solver, ledger, rivals, False), self.policy.closure_place_m
-        several = np.unique(closure_places(numbers, within)).size > 1
+        several = np.unique(_places(closure_numbers(solver, ledger, rivals, False), self.policy)).size > 1
         untried = np.array([row for row in ledger.tested().tolist() if ledger.closures[row].tried < newest], np.int64)
         find = self._least_sure_place if several else self._least_sure
         on_trial, odds, stay = find(solver, ledger, untried)
@@ -201,10 +229,10 @@ class ClosureJudge:
             without = without_factors(solver, [c.factor_id for c in on_trial])
         except SolverError:
             return stay  # the map does not stand without them
-        chosen = self._chosen(without, ledger, rivals)
+        chosen = self._chosen(without, ledger, rivals, True)
         believed = np.array([reason in _BELIEVED for reason in chosen.reasons])
         numbers = closure_numbers(without, ledger, rivals[believed], False)
-        places = np.unique(closure_places(numbers, within)).size if believed.any() else 0
+        places = np.unique(_places(numbers, self.policy)).size if believed.any() else 0
         is_more_likely = places > 0 and chosen.chance[believed].min() <= self.policy.closure_chance_max * odds
         if not (places > 1 if several else is_more_likely):
             return stay
@@ -225,15 +253,20 @@ class ClosureJudge:
         return [ledger.closures[row] for row in tested[near[0] & near[1]].tolist()], 1.0, []
 
     def _least_sure(self, solver: Solver, ledger: Ledger, untried: I64) -> tuple[list[Closure], float, list[_Row]]:
-        """The one that is least sure by all the others, and its odds; and the rest that may have been, with theirs."""
+        """The one that is least sure by all the others, and its odds; and the rest that may have been, with theirs.
+
+        Of one that nothing else holds these are what they were when it came.
+        """
         if ledger.dim != _PLANE_DIM:
             return [], 1.0, []
         least = self.policy.closure_sets_max
         chance = np.array([ledger.closures[row].chance for row in untried.tolist()])
-        unsure = untried[np.argsort(-chance, kind="stable")][: min(_WORST, np.count_nonzero(chance > least))]
+        order = np.argsort(-chance, kind="stable")[: min(_WORST, np.count_nonzero(chance > least))]
+        unsure = untried[order]
         if not unsure.size:
             return [], 1.0, []
         odds = odds_without(closure_numbers(solver, ledger, unsure), self.limits[ledger.dim].spread)
+        odds = np.where(np.isnan(odds), chance[order], odds)
         closures = [ledger.closures[row] for row in unsure.tolist()]
         worst = int(odds.argmax())
         on_trial = [closures[worst]] if odds[worst] > least else []
@@ -250,8 +283,8 @@ def _believes(chosen: Chosen) -> bool:
     return any(reason in _BELIEVED for reason in chosen.reasons)
 
 
-def _as_suspect(c: Closure, reason: str) -> _Row:
-    return c, SUSPECT, reason, c.distance, c.chance, c.tried
+def _places(numbers: ClosureNumbers, policy: ClosurePolicy) -> I64:
+    return closure_places(numbers.a, numbers.b, policy.closure_place_m)
 
 
 def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:

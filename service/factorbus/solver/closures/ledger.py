@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from factorbus.solver.closures.choosing import IMPROBABLE
+from factorbus.solver.closures.choosing import IMPROBABLE, RIVAL, ClosureOdds
 from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.factor_graph import FactorGraph, with_room
@@ -22,7 +22,8 @@ CLOSURE_STATES: tuple[str, ...] = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 BELIEVED = {ACCEPTED, RESTORED}
-_COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_new", "is_tested", "is_improbable")
+_BURST = 10  # closures that one mistake brings
+_COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_new", "is_tested", "is_improbable", "is_rival")
 
 
 @dataclass(slots=True, eq=False)
@@ -91,6 +92,10 @@ class ClosureVerdicts(NamedTuple):
     tried: I64
 
 
+_NONE: I64 = np.empty(0, np.int64)
+NO_VERDICTS = ClosureVerdicts(_NONE, (), (), np.empty(0), np.empty(0), _NONE)
+
+
 class Ledger:
     """Closures of one kind.
 
@@ -98,7 +103,8 @@ class Ledger:
     bound (n, d, d): rᵀ W r is no less than d² of one that is in, and no more than that of a suspect, for as long as the
     map only gets factors, to first order; NaN: not known.  Nothing but work depends on it.
     ends (n, 2): variables.  is_suspect, is_tested (n,): whether it may go in, and whether it is in and may go out;
-    is_new, is_improbable (n,): a suspect for that reason; accepted, improbable: how many are in, and are that.
+    is_new, is_improbable, is_rival (n,): a suspect for that reason, rivals are improbable, too; accepted, improbable,
+    rivals: how many are in, and are that.
     looked (n,): when it was last looked at, in looks.  All columns have room behind for more.
     """
 
@@ -108,8 +114,9 @@ class Ledger:
         k, d = 3 if self.dim == 3 else 4, self.dim
         self.z, self.noise, self.bound = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
         self.ends, self.looked = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
-        self.is_suspect, self.is_new, self.is_tested, self.is_improbable = (np.zeros(0, bool) for _ in range(4))
-        self.accepted = self.improbable = 0
+        self.is_suspect, self.is_new, self.is_tested = (np.zeros(0, bool) for _ in range(3))
+        self.is_improbable, self.is_rival = np.zeros(0, bool), np.zeros(0, bool)
+        self.accepted = self.improbable = self.rivals = 0
 
     def add(self, closure: Closure, ends: Sequence[int], looked: int) -> None:
         """One more."""
@@ -124,7 +131,8 @@ class Ledger:
         """Several more, of which these columns are known."""
         n, count = len(self.closures), len(self.closures) + len(new)
         self._make_room(count)
-        self.ends[n:count], self.looked[n:count] = ends, looked
+        self.ends[n:count] = ends
+        self.looked[n:count] = [looked + (closure.state == ACCEPTED) for closure in new]
         self.z[n:count], self.noise[n:count], self.bound[n:count] = z, noise, bound
         for row, closure in enumerate(new, n):
             closure.row = row
@@ -152,18 +160,22 @@ class Ledger:
             self.bound[row] = weight @ np.linalg.inv(self.bound[row]) @ weight
         elif self.is_suspect[row] != is_suspect:
             self.bound[row] = np.nan
-        is_tested, is_improbable = closure.state == ACCEPTED, is_suspect and closure.reason == IMPROBABLE
+        is_tested, is_rival = closure.state == ACCEPTED, is_suspect and closure.reason == RIVAL
+        is_improbable = is_rival or (is_suspect and closure.reason == IMPROBABLE)
         self.accepted += is_tested - bool(self.is_tested[row])
         self.improbable += is_improbable - bool(self.is_improbable[row])
+        self.rivals += is_rival - bool(self.is_rival[row])
         self.is_suspect[row], self.is_tested[row], self.is_improbable[row] = is_suspect, is_tested, is_improbable
+        self.is_rival[row] = is_rival
         self.is_new[row] = is_suspect and closure.reason == NEW
 
-    def odds(self) -> float:
-        """Of a closure to be false, by those that have come (Laplace's rule), and even at most.
+    def odds(self) -> ClosureOdds:
+        """By those that have come (Laplace's rule), and even at most.
 
-        Improbable ones count as false, those that are in as right.
+        Improbable ones count as false, those that are in as right; as mistakes that bring several at one place, rivals.
         """
-        return min((1 + self.improbable) / (1 + self.accepted), 1.0)
+        false, mistaken = (1 + self.improbable) / (1 + self.accepted), (_BURST + self.rivals) / (_BURST + self.accepted)
+        return ClosureOdds(min(false, 1.0), min(mistaken, 1.0))
 
     def suspects(self) -> I64:
         """Rows."""
@@ -208,8 +220,11 @@ class ClosureLedger:
         return closure
 
     def enter(self, kind: str, new: Sequence[Closure], ends: I64, z: F64, noise: F64, bound: F64) -> None:
-        """New ones of a kind, with their columns."""
+        """New ones of a kind, with their columns; of those that are in that is a look."""
         self.of_kind[kind].enter(new, ends, self.looks, z, noise, bound)
+        if any(closure.is_in for closure in new):
+            self.looks += 1
+            self.moved_at = self.looks
         self.of_factor |= {closure.factor_id: closure for closure in new}
         for closure in new:
             self._counts[closure.state] += 1
@@ -239,11 +254,11 @@ class ClosureLedger:
         return verdicts_of(rows)
 
     def note(self, verdicts: ClosureVerdicts, revision: int) -> list[Closure]:
-        """They are so from now on; gives those whose state is another than before.  Raises NotAClosure."""
+        """They are so from now on; gives those whose state is another, and new ones.  Raises NotAClosure."""
         self.looks += 1
         changed, moved, lost = [], False, False
         for k, c in enumerate(self.named(verdicts.factors.tolist())):
-            was, ledger = (c.state, c.is_in), self.of_kind[c.factor.kind]
+            was, is_new, ledger = (c.state, c.is_in), c.reason == NEW, self.of_kind[c.factor.kind]
             c.state, c.reason, c.tried = verdicts.states[k], verdicts.reasons[k], int(verdicts.tried[k])
             c.distance, c.chance = float(verdicts.distance[k]), float(verdicts.chance[k])
             ledger.looked[c.row] = self.looks
@@ -252,6 +267,7 @@ class ClosureLedger:
                 self._counts[was[0]] -= 1
                 self._counts[c.state] += 1
                 c.changed = revision
+            if c.state != was[0] or is_new:
                 changed.append(c)
             moved, lost = moved or c.is_in != was[1], lost or (was[1] and not c.is_in)
         if moved:

@@ -147,7 +147,13 @@ class TrustedForest:
 
     def _join(self, one: object, other: object) -> bool:
         """Join two, the smaller under the larger; False: they are."""
-        first, second = self._root(one), self._root(other)
+        first = self._root(one)
+        if other not in self._above:  # the next pose, as a rule
+            self._above[other], self._sizes[other] = first, 1
+            self._sizes[first] += 1
+            self._linked.append((other, first))
+            return True
+        second = self._root(other)
         if first == second:
             return False
         if self._sizes[first] < self._sizes[second]:

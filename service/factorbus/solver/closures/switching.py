@@ -13,13 +13,10 @@ import numpy as np
 
 from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.closures.ledger import BELIEVED, Closure, ClosureLedger, ClosureVerdicts
-from factorbus.solver.closures.loops import SplitFactors
 from factorbus.solver.divergence import copied
-from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.groups import BatchLike, FactorGroup
+from factorbus.solver.graph.groups import FactorGroup
 from factorbus.solver.kernels.jit.compile import F64, I64
-from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
 
 
@@ -83,34 +80,6 @@ def note_switch(
     if switch.into:
         graph.rename_last(np.array([c.factor_id for c in switch.into]), following)
     return ledger.note(verdicts, revision)
-
-
-def check_whole(graph: FactorGraph, batch: BatchLike) -> None:
-    """Whether all of a batch could go in, closures too.  Raises as `stage` does; nothing has changed either way."""
-    mark = graph.mark()
-    admit(graph, batch)
-    graph.forget(mark)
-
-
-def add_closures(
-    graph: FactorGraph, ledger: ClosureLedger, split: SplitFactors, first: int, revision: int
-) -> list[Closure]:
-    """The trusted factors of an insert are in, in the last rows: name them, and its closures, as if all were in.
-
-    first: the id of the first one.
-    """
-    if not split.closing:
-        return []
-    if split.trusted_at.size:
-        rows = np.arange(int(graph.rows_of(np.array([first]))[0]), int(graph.counts[at.FACTORS]))
-        names = first + split.trusted_at[graph.ids_of(rows) - first]
-    else:
-        names = np.empty(0, np.int64)
-    graph.rename_last(names, first + split.trusted_at.size + split.closing_at.size)
-    return [
-        ledger.add(factor, first + place, graph, revision)
-        for factor, place in zip(split.closing, split.closing_at.tolist(), strict=True)
-    ]
 
 
 def without_factors(solver: Solver, factors: Sequence[int]) -> Solver:

@@ -1,0 +1,72 @@
+"""What a user's insert with changes asks of a map that tests its closures, of which some are not in the graph."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from factorbus.proto.messages import Change, Insert
+from factorbus.service.core.events import Arrived
+from factorbus.solver.closures.ledger import (
+    NO_VERDICTS,
+    REJECTED,
+    RESTORED,
+    ClosureLedger,
+    ClosureVerdicts,
+    SwitchedOff,
+)
+from factorbus.solver.closures.switching import ClosureSwitch, planned_switch
+from factorbus.solver.errors import NamedTwice
+
+_SAYS = {"accept": RESTORED, "reject": REJECTED}
+
+
+class AskedChanges(NamedTuple):
+    """made: the insert that does it.  gone: closures that are removed and were out."""
+
+    made: Arrived
+    said: ClosureVerdicts
+    switch: ClosureSwitch
+    gone: set[int]
+
+
+def asked_changes(ledger: ClosureLedger, insert: Arrived, content: Insert) -> AskedChanges:
+    """What changes come to in a map with this ledger.  Raises SolverError."""
+    said, left, gone = list[ClosureVerdicts](), list[Change](), set[int]()
+    for change in content.changes:
+        ids = [] if change.factors is None else change.factors.tolist()
+        if change.change in _SAYS:
+            said.append(ledger.said(ids, _SAYS[change.change]))
+            continue
+        out = [factor for factor in ids if (c := ledger.of_factor.get(factor)) is not None and not c.is_in]
+        if out and change.change != "remove_factors":
+            raise SwitchedOff(change.change, out[0], ledger.of_factor[out[0]].state)
+        _check_once(change.change, [*gone, *out])
+        gone |= set(out)
+        if not out or len(out) < len(ids):
+            left.append(change._replace(factors=np.array([i for i in ids if i not in gone])) if out else change)
+    verdicts = _together(said)
+    _check_once("accept, reject and remove_factors", [*verdicts.factors.tolist(), *gone])
+    switch = planned_switch(ledger, verdicts)
+    removals = [Change("remove_factors", removal.factors) for removal in switch.removals]
+    batch: Any = content.batch._replace(factors=(*content.batch.factors, *switch.additions))
+    made = content._replace(batch=batch, changes=(*removals, *left))
+    return AskedChanges(insert._replace(content=made), verdicts, switch, gone)
+
+
+def _together(said: Sequence[ClosureVerdicts]) -> ClosureVerdicts:
+    if not said:
+        return NO_VERDICTS
+    columns = zip(*said, strict=True)
+    factors, states, reasons, distance, chance, tried = columns
+    return ClosureVerdicts(
+        np.concatenate(factors), sum(states, ()), sum(reasons, ()), np.concatenate(distance), np.concatenate(chance),
+        np.concatenate(tried),
+    )  # fmt: skip
+
+
+def _check_once(what: str, factors: Sequence[int]) -> None:
+    """Raises NamedTwice."""
+    for k, factor in enumerate(factors):
+        if factor in factors[:k]:
+            raise NamedTwice(what, f"factor {factor}", factor=factor)
