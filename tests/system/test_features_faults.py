@@ -97,9 +97,7 @@ def test_no_feature_is_lost_doubled_or_out_of_order(spawn: Spawn, endpoint: str)
             fronts = [front(bus, q[0]) for q in questions]
             # Under load the first questions are answered before all workers have started, and a fast
             # machine has answered most of them before a fault comes.
-            while (
-                sum(workers.faults.values()) < FAULTS or len(helped - {"in-place"}) <= 2 or retried < FAULTS // 10
-            ):
+            while sum(workers.faults.values()) < FAULTS or len(helped - {"in-place"}) <= 2 or retried < FAULTS // 10:
                 under_way = []
                 for (observations, P, _, _), features in zip(questions, fronts, strict=True):
                     x = np.concatenate([observations.state, np.zeros(observations.width - 13)])

@@ -74,16 +74,16 @@ class Solver:
     def step(self, settle: bool = False, budget: float | None = None) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
 
-        budget: in the place of `Options.step_budget`, for this step.
+        budget: in the place of `Options.step_budget`, for this step, and also where nothing is staged.
 
         Raises BadOption; or Underconstrained or NotFinite, and what was staged since the last step is taken back then,
         and the solver is as it was after that step, bit for bit.
         """
         if budget is None:
-            budget = self._options.step_budget
-        elif not budget >= 0.0:
+            return self._stepper.step(settle, self._options.step_budget)
+        if not budget >= 0.0:
             raise BadOption("budget", repr(budget), "0 or more, 0: without bound")
-        return self._stepper.step(settle, budget)
+        return self._stepper.step(settle, budget, always=True)
 
     def estimate(self) -> list[Group]:
         """A copy of all values: per kind, in insertion order, fixed variables in groups of their own.

@@ -79,8 +79,8 @@ class IncrementalSteps:
         """For tests."""
         return self._system
 
-    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
-        """As `Solver.step`."""
+    def step(self, settle: bool, budget: float = 0.0, always: bool = False) -> StepReport:
+        """As `Solver.step`; there is no budget."""
         return self._step(settle, self._options.initialize_locally)
 
     def resume(self, settle: bool) -> StepReport:
