@@ -128,8 +128,8 @@ def rounding_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last number of every step is rounded as another processor might."""
     true_step = Solver.step
 
-    def step(solver: Solver, settle: bool = False) -> Any:
-        report = true_step(solver, settle)
+    def step(solver: Solver, settle: bool = False, budget: float | None = None) -> Any:
+        report = true_step(solver, settle, budget)
         last = int(graph_in(solver).counts[at.VALUES]) - 1
         graph_in(solver).values[last] = np.nextafter(graph_in(solver).values[last], 9.0)
         return report

@@ -117,6 +117,11 @@ class Solver:
         """
         return self._stepper.unfinished
 
+    @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones, as one with a budget may."""
+        return self._stepper.complete
+
     def convertible(self, below: float) -> I64:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
         return self._graph.keys[find_convertible(self._graph, below)]

@@ -16,6 +16,11 @@ class Stepper(Protocol):
         Raises Underconstrained, NotFinite; what is new is taken back then, and all is as it was, bit for bit."""
         ...
 
+    @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones."""
+        ...
+
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
         ...

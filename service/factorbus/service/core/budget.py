@@ -46,6 +46,10 @@ class StepBudget:
             return 0.0
         return float(round(self.budget_ms * self.units_per_ms)) * 2.0**doubled
 
+    def restore(self, use: BudgetUse) -> None:
+        """The map was here before, and this is known of its last step."""
+        self._use = use
+
     def stepped(self, stepped: Stepped) -> None:
         """A step was made."""
         if not self.budget_ms:
@@ -70,12 +74,15 @@ class StepBudget:
         """What else the statistics of a map say."""
         if not self.budget_ms:
             return {}
-        return {
+        told = {
+            "budget_ms": self.budget_ms,
             "step_ms": self._step_ms,
             "deferred_relinearizations": self._use.deferred_relinearizations,
-            "unsolved": self._use.unsolved,
+            "unsolved": self._use.unsolved if self._use.unsolved < math.inf else None,
+            "complete": self.complete,
             "units_per_ms": self.units_per_ms,
         }
+        return {"budget": told}
 
 
 def use_of(reported: Mapping[str, Any]) -> BudgetUse | None:

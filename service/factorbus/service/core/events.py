@@ -171,7 +171,7 @@ class Restored(NamedTuple):
     """How a map is that was here before.
 
     differs: why its journal, run again, may give other bits; empty: as far as is known it gives the same; None: it has
-    none.  closures: as `Applied` has it.
+    none.  closures: as `Applied` has it.  complete: the last step left nothing for later ones.
     """
 
     revision: int
@@ -182,6 +182,7 @@ class Restored(NamedTuple):
     unfinished: bool = False
     differs: str | None = None
     closures: Mapping[str, int] | None = None
+    complete: bool = True
 
 
 def reproducible_fields(differs: str | None) -> dict[str, Any]:

@@ -9,6 +9,7 @@ At most one InsertBatch is out at a time, so what the solver does next is decide
 then.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -26,6 +27,7 @@ from factorbus.service.core.events import (
     Arrived,
     ArrivedQuestion,
     Asker,
+    BudgetUse,
     Drained,
     Effect,
     Follow,
@@ -203,7 +205,9 @@ class MapCore:
         for name, following, answered in ((*sender,) for sender in senders if sender[0] != JUDGE):
             self._admission.restore(name, following, answered, self._created)
         self.revision, self.variables, self.factors, self._statistics.chi2 = restored[:4]
-        self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2)
+        use = BudgetUse(unsolved=math.inf, complete=restored.complete)
+        self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2, use)
+        self._budget.restore(use)
         self._moved_at, self.differs = restored.revision, restored.differs
         self._statistics.closures = restored.closures
 

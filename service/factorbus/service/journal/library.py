@@ -87,7 +87,9 @@ def restored(map_solver: MapSolver, differs: str | None = None) -> Restored:
     """How the map in `map_solver` is.  differs: as `Restored` has it."""
     chi2 = map_solver.chi2() if map_solver.revision else 0.0
     done = map_solver.converged, map_solver.unfinished, differs
-    return Restored(map_solver.revision, *map_solver.size, chi2, *done, map_solver.closure_counts())
+    return Restored(
+        map_solver.revision, *map_solver.size, chi2, *done, map_solver.closure_counts(), map_solver.complete
+    )
 
 
 def log_owner(owner: str) -> None:

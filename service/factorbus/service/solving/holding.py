@@ -123,6 +123,11 @@ class Holding:
         """Whether a further step would bring the estimate nearer to its optimum."""
         return self._unfinished
 
+    @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones."""
+        return bool(self._solver.complete)
+
     def enter(self, epoch: int) -> None:
         """From now on answers and deltas name this epoch."""
         self._epoch = epoch

@@ -158,6 +158,11 @@ class TreeSteps:
         return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
 
     @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones."""
+        return not (self._tree.deferred or self._tree.behind)
+
+    @property
     def _has_new(self) -> bool:
         """Whether anything came or was edited since the last step."""
         return self._graph.mark() != self._mark or self._tree.state.item(tl.S_EDITED) != 0
@@ -348,8 +353,7 @@ class TreeSteps:
         model, chi2, error, least = (totals.item(k) for k in (tl.T_MODEL, tl.T_CHI2, tl.T_ERROR, tl.T_LEAST))
         more = max(chi2 - model, 0.0) if self._tree.behind else 0.0
         unsolved = 0.0 if result and result.converged else min(error + more, max(chi2, 0.0) - least)
-        deferred = self._tree.deferred
-        return deferred, unsolved, totals.item(tl.T_WORK), budget, not (deferred or self._tree.behind)
+        return self._tree.deferred, unsolved, totals.item(tl.T_WORK), budget, self.complete
 
 
 def _because(count: int, rounds: int, chords: int) -> str:
