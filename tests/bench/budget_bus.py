@@ -74,6 +74,10 @@ def drive(steps: Sequence[Batch], poses: int, budget_ms: float, clients: int, pe
         "budget_ms": budget_ms,
         "insert_to_delta_ms": {"p50": float(p50), "p99": float(p99), "max": float(most)},
         "step_ms": watch.step_ms(before["revision"]),
+        "work_share": {
+            "p99": float(np.percentile(watch.work_shares or [0.0], 99)),
+            "max": max(watch.work_shares or [0.0]),
+        },
         "left": watch.left / max(len(watch.steps_ms), 1),
         "complete_after_s": idle_s,
         "solver_cpu_s": stats["solver_cpu_s"] - before["solver_cpu_s"],
@@ -146,7 +150,7 @@ class Watch:
         self._came: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
         self._at: dict[int, float] = {}
         self.steps_ms: dict[int, float] = {}
-        self.left = 0
+        self.left, self.work_shares = 0, list[float]()
         self._session = zenoh.open(config)
         self._session.declare_subscriber(keys.delta_key(MAP), zenoh.handlers.Callback(self._take, indirect=False))
 
@@ -161,6 +165,8 @@ class Watch:
             self._at[delta.revision] = at
             self.steps_ms[delta.revision] = delta.report["step_ms"]
             self.left += not delta.report["complete"]
+            if "budget" in delta.report:
+                self.work_shares.append(delta.report["work"] / delta.report["budget"])
         return self._at[revision]
 
     def step_ms(self, after: int) -> Row:
@@ -182,6 +188,7 @@ def shown_on_bus(row: Row) -> str:
         f"  {row['clients']} clients, {row['inserts']} inserts"
         f"  insert to delta {delta['p50']:.2f} {delta['p99']:.2f} {delta['max']:.2f}"
         f"  steps {steps['p50']:.2f} {steps['p99']:.2f} {steps['max']:.2f}"
+        f"  work {row['work_share']['p99']:.2f} {row['work_share']['max']:.2f}"
         f"  left {row['left']:.1%}, complete after {row['complete_after_s']:.2f} s"
         f"  χ² {row['chi2']:.6g}  cpu {row['cpu_ratio']:.2f}"
     )
