@@ -119,7 +119,7 @@ def test_what_is_told_and_settled(services: Callable[..., Services], tmp_path: P
         with pytest.raises(Refused) as refused:
             bus.create("wrong", "inc-l", budget_ms=5.0)
         assert refused.value.code == "no_budget"
-        with bus.map("tight", budget_ms=TIGHT_MS) as driven:
+        with bus.map("tight") as driven:
             reports = [driven.insert(batch).report for batch in batches]
             left = [report for report in reports if not report["complete"]]
             assert left

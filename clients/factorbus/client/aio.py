@@ -78,11 +78,9 @@ class Bus:
         create: bool = True,
         interest: Interest | None = None,
         closures: str | None = None,
-        budget_ms: float | None = None,
     ) -> AsyncIterator[Map]:
         """As `factorbus.client.Bus.map`, in `async with`; leaving it waits for what was sent."""
         how = {"window": window, "mirror": mirror, "create": create, "interest": interest, "closures": closures}
-        how["budget_ms"] = budget_ms
         joined = await asyncio.to_thread(self._bus.map, name, mode, **how)
         try:
             here = Map(joined, window)

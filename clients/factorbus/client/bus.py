@@ -77,7 +77,6 @@ class Bus:
         client: str = "",
         interest: Interest | None = None,
         closures: str | None = None,
-        budget_ms: float | None = None,
     ) -> Map:
         """Join map `name`, creating it if there is none (with create=False: UnknownMap).
 
@@ -85,7 +84,7 @@ class Bus:
         it is there.  client: who inserts into this map, where one connection is used for several; empty: that of
         `connect`.  interest: mirror these variables alone, at its rate; `insert` does not wait until they are there.
         closures: "trust" or "test", what becomes of its loop closures (None: as the service has it for new maps).
-        budget_ms: what a step of it may take, as in `create`.
+        Its steps have the budget that the service has for new maps; `create` it first for another.
         Raises Refused, Unavailable, BadName, BadOption, UnknownKind, UnknownMap, NotSupported.
         """
         keys.checked_name("map", name)
@@ -102,7 +101,7 @@ class Bus:
             client,
             self.timeout_s,
             window,
-            lambda: self.create(name, mode, closures=closures, budget_ms=budget_ms) if create else self._existing(name),
+            lambda: self.create(name, mode, closures=closures) if create else self._existing(name),
         )
         self._maps = [*(each for each in self._maps if not each.closed), joined]
         try:
