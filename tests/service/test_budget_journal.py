@@ -69,7 +69,8 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Kept:
 
 def values(map_solver: MapSolver) -> dict[int, bytes]:
     taken = map_solver.snapshot([Question("estimate")])
-    return {int(key): row.tobytes() for g in taken.variables for key, row in zip(g.keys, g.values, strict=True)}
+    groups = [(g.keys, g.values) for g in taken.variables if g.values is not None]
+    return {int(key): row.tobytes() for ids, numbers in groups for key, row in zip(ids, numbers, strict=True)}
 
 
 def again() -> MapSolver:
