@@ -20,6 +20,7 @@ from factorbus.service.journal.grafting import Graft, Grafted, sent_records
 from factorbus.service.journal.keeping import Keeper
 from factorbus.service.journal.library import Library, log_owner, open_library
 from factorbus.service.maps.host import Host
+from factorbus.service.questions.admin import MadeAs
 from factorbus.service.solving.arrival import read_insert
 
 PATIENCE_S = 60.0
@@ -33,7 +34,8 @@ class End:
         library = open_library(config, log_owner, threading.Event())
         assert isinstance(library, Library)
         self.library, self.folder = library, folder / "m"
-        kept = library.open("m", Limits()) if library.has("m") else library.make("m", "bayes-tree", Limits(), closures)
+        made = MadeAs("bayes-tree", closures)
+        kept = library.open("m", Limits()) if library.has("m") else library.make("m", made, Limits())
         core = MapCore("m", kept.header.mode, kept.header.epoch, Limits(), 0.0, closures)
         kept.restore(core)
         self.told: queue.SimpleQueue[Effect] = queue.SimpleQueue()

@@ -58,6 +58,7 @@ from factorbus.proto.symbols import symbol
 # The map that inserts and answers are of: stated there, and solved.
 _KITCHEN = runpy.run_path(str(Path(__file__).with_name("kitchen.py")))
 _TESTED = runpy.run_path(str(Path(__file__).with_name("tested.py")))
+_BUDGETS = runpy.run_path(str(Path(__file__).with_name("budgets.py")))
 _COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64", "scale": "f64"}
 # Of the questions about uncertainty and their answers, §16.
 _COLUMNS |= dict.fromkeys(("others", "dims", "other_dims", "landmarks", "observations", "candidates"), "i64")
@@ -90,6 +91,7 @@ def vectors() -> dict[str, bytes]:
         **kitchen,
         **_records(17),
         **_TESTED["messages"](),
+        **_BUDGETS["messages"](),
         **_interests(codec.decode_estimate(kitchen["estimate"])),
         **{
             f"kinds/{name}": codec.encode_insert(Insert(1, _one_of(kind), epoch=7))

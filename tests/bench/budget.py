@@ -2,6 +2,8 @@
 
     factorbus bench budget                               streets, trees, a sphere, and the public sets that are there
     factorbus bench budget --only manhattan --poses 20000 --budget-ms 10,5
+    factorbus bench budget --bus --poses 20000           eight clients in one map of streets, on a service with a
+                                                         budget and on one without: `budget_bus.py`
 
 A step may take 10⁸ units of work for each millisecond of the budget.  A row has, of a world and a budget,
 
@@ -28,6 +30,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from bench.budget_bus import compare_on_bus, shown_on_bus
 from bench.replays.problems import ALL, Problem, choose, load
 from naive.solver_parts import graph_in
 
@@ -52,7 +55,13 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=5, help="of a world (5)")
     parser.add_argument("--budget-ms", default="10,2", help="MS,...: budgets (10,2)")
     parser.add_argument("--json", action="store_true", help="print the rows as JSON")
+    parser.add_argument("--bus", action="store_true", help="clients of a service, which drive in one map")
+    parser.add_argument("--clients", type=int, default=8, help="with --bus (8)")
+    parser.add_argument("--inserts", type=int, default=60, help="with --bus: of each client (60)")
+    parser.add_argument("--period-s", type=float, default=0.5, help="with --bus: between inserts of a client (0.5)")
     told = parser.parse_args()
+    if told.bus:
+        return on_bus(told)
     only = [each for each in told.only.split(",") if each]
     worlds = [Problem(name, name, told.poses, None, told.seed) for name in _WORLDS]
     sets = [each for each in choose(False, ALL)[0] if not each.is_world]
@@ -62,6 +71,18 @@ def main() -> int:
             rows.append(compare(problem, budget_ms))
             if not told.json:
                 print(shown(rows[-1]), flush=True)
+    if told.json:
+        print(json.dumps(rows, indent=1))
+    return 0
+
+
+def on_bus(told: argparse.Namespace) -> int:
+    """Rows of clients of a service."""
+    rows: list[Row] = []
+    for budget_ms in [float(each) for each in told.budget_ms.split(",")]:
+        rows += compare_on_bus(told.poses, budget_ms, told.clients, told.inserts, told.period_s, told.seed)
+        if not told.json:
+            print(*map(shown_on_bus, rows[-2:]), sep="\n", flush=True)
     if told.json:
         print(json.dumps(rows, indent=1))
     return 0

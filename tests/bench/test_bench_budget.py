@@ -2,7 +2,10 @@
 
 import pytest
 from bench.budget import compare, shown, stretches
+from bench.budget_bus import together
 from bench.replays.problems import Problem
+
+from factorbus.simulate import manhattan
 
 WORLD = Problem("manhattan", "streets", poses=400, seed=3)
 
@@ -25,3 +28,16 @@ def test_a_wide_budget_leaves_nothing_and_a_tight_one_does() -> None:
 def test_stretches_are_runs_of_steps() -> None:
     assert stretches([True, True, False, True]) == {"p50": 1.5, "p99": pytest.approx(1.99), "share": 0.75}
     assert stretches([False, False]) == {"p50": 0.0, "p99": 0.0, "share": 0.0}
+
+
+def test_a_client_goes_on_with_keys_of_its_own_into_what_was_there_before() -> None:
+    steps = [step.batch for step in manhattan(120, 5)]
+    first = int(steps[60].variables[0].keys[0])
+    made, plain = together(steps[60:], first, 1000), together(steps[60:])
+    assert made.variables[0].keys.tolist() == [key + 1000 for key in plain.variables[0].keys.tolist()]
+    for ours, theirs in zip(made.factors, plain.factors, strict=True):
+        moved = ours.keys != theirs.keys
+        assert (moved == (theirs.keys >= first)).all()
+        assert (ours.keys[moved] - theirs.keys[moved] == 1000).all()
+        assert ours.measured.tobytes() == theirs.measured.tobytes()
+    assert sum(group.keys.shape[0] for group in plain.factors) == sum(batch.factor_count for batch in steps[60:])

@@ -188,8 +188,8 @@ class Faulty(Solver):
             raise IndexError("a fault of the solver")
         return self._run("stage", lambda: super(Faulty, self).stage(batch))
 
-    def step(self, settle: bool = False) -> Any:
-        return self._run("step", lambda: super(Faulty, self).step(settle))
+    def step(self, settle: bool = False, budget: float | None = None) -> Any:
+        return self._run("step", lambda: super(Faulty, self).step(settle, budget))
 
     def changed(self) -> Any:
         return self._run("changed", super().changed)

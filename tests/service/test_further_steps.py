@@ -198,7 +198,7 @@ def test_a_further_step_that_is_refused_leaves_all_as_it_is(monkeypatch: pytest.
     map_solver = unconverged()
     before, revision = values(map_solver), map_solver.revision
 
-    def refuse(solver: Solver, settle: bool = False) -> Any:
+    def refuse(solver: Solver, settle: bool = False, budget: float | None = None) -> Any:
         raise NotFinite("χ²")
 
     monkeypatch.setattr(Solver, "step", refuse)
@@ -213,11 +213,11 @@ def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pyte
         map_.apply(one)
     tried: list[Solver] = []
 
-    def refuse(solver: Solver, settle: bool = False) -> Any:
+    def refuse(solver: Solver, settle: bool = False, budget: float | None = None) -> Any:
         if has_nothing_new(solver):
             tried.append(solver)
             raise NotFinite("χ²")
-        return true_step(solver, settle)
+        return true_step(solver, settle, budget)
 
     monkeypatch.setattr(Solver, "step", refuse)
     assert map_.apply(further=True) == []
@@ -234,9 +234,9 @@ def escaping(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every further step leaves a value beyond what can be kept."""
     true_step, true_changed, escaped = Solver.step, IncrementalSteps.changed, set[Stepper]()
 
-    def step(solver: Solver, settle: bool = False) -> Any:
+    def step(solver: Solver, settle: bool = False, budget: float | None = None) -> Any:
         further = has_nothing_new(solver)
-        report = true_step(solver, settle)
+        report = true_step(solver, settle, budget)
         if further:
             graph_in(solver).values[0] = 2 * MOST_NUMBER
             escaped.add(stepper_in(solver))

@@ -27,11 +27,11 @@ class Waiting(Solver):
         super().__init__(Options.of(mode="all-batch", **FEW))
         self.begun, self.leave = threading.Semaphore(0), threading.Semaphore(0)
 
-    def step(self, settle: bool = False) -> Any:
+    def step(self, settle: bool = False, budget: float | None = None) -> Any:
         if self.factor_count == POSES and not settle and self._stepper.mark == self._graph.mark():
             self.begun.release()
             assert self.leave.acquire(timeout=PATIENCE_S)
-        return super().step(settle)
+        return super().step(settle, budget)
 
 
 class Told:
@@ -116,8 +116,8 @@ def test_a_map_whose_steps_are_of_no_use_does_not_spin() -> None:
     class Stuck(Solver):
         moves = True
 
-        def step(self, settle: bool = False) -> Any:
-            report = super().step(settle)
+        def step(self, settle: bool = False, budget: float | None = None) -> Any:
+            report = super().step(settle, budget)
             self.moves = bool(report.new_factors or report.new_variables)
             if self.moves:
                 return report._replace(converged=self.factor_count < POSES)

@@ -67,10 +67,10 @@ class Held(Solver):
         self.begun, self.leave = threading.Semaphore(0), threading.Event()
         self.leave.set()
 
-    def step(self, settle: bool = False) -> Any:
+    def step(self, settle: bool = False, budget: float | None = None) -> Any:
         self.begun.release()
         assert self.leave.wait(PATIENCE_S)
-        return super().step(settle)
+        return super().step(settle, budget)
 
 
 class Setup:
@@ -135,7 +135,7 @@ def keys(*names: str) -> np.ndarray:
 @pytest.fixture(autouse=True)
 def no_step_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever this machine does meanwhile."""
-    monkeypatch.setattr("factorbus.service.core.map_state.SHORT_S", 1e9)
+    monkeypatch.setattr("factorbus.service.core.short_batches.SHORT_S", 1e9)
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from factorbus.cli.main import main
 from factorbus.journal import chain
 from factorbus.journal.bundle import export_map, import_map
 from factorbus.journal.checkpoints import file_of, read_checkpoint, remove_strangers, write_checkpoint
+from factorbus.journal.connecting import FORM, FORM_WITH_BUDGETS
 from factorbus.journal.digest import sealed
 from factorbus.journal.folders import left_behind, maps_in
 from factorbus.journal.lock import own
@@ -30,7 +31,7 @@ from factorbus.journal.problems import (
     NoJournal,
 )
 from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Epoch, JournalRecord
-from factorbus.journal.store import FORM, NAME, Checkpoint, Store, create, open_store
+from factorbus.journal.store import NAME, Checkpoint, Store, create, open_store
 
 
 def entry(client: str, sequence: int, message: bytes = b"hello") -> Entry:
@@ -219,7 +220,10 @@ def test_a_journal_that_was_not_finished_is_not_there(tmp_path: Path) -> None:
 
 def test_of_another_form_or_no_journal_at_all(store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     store.close()
-    for form, words in ((FORM + 1, "a newer version wrote it"), (FORM - 1, "export it with the version that wrote it")):
+    for form, words in (
+        (FORM_WITH_BUDGETS + 1, "a newer version wrote it"),
+        (FORM - 1, "export it with the version that wrote it"),
+    ):
         with sqlite3.connect(store.path) as database:
             database.execute(f"PRAGMA user_version = {form}")
         database.close()

@@ -24,6 +24,7 @@ from factorbus.service.core.map_state import MapCore
 from factorbus.service.journal.keeping import Events
 from factorbus.service.journal.library import CopiedAt, Kept, Library, open_library
 from factorbus.service.journal.recovery import verify
+from factorbus.service.questions.admin import MadeAs
 from factorbus.service.questions.answers import Question
 from factorbus.service.solving.arrival import read_insert
 from factorbus.simulate import manhattan
@@ -101,7 +102,7 @@ def reopen(library: Library) -> Callable[[], Session]:
 @pytest.fixture(params=["bayes-tree", "inc-l"])
 def values(library: Library, request: pytest.FixtureRequest) -> dict[int, bytes]:
     """A map with twelve inserts and a checkpoint after the eighth, closed; what its values were."""
-    session = Session(library.make("m", request.param, Limits()))
+    session = Session(library.make("m", MadeAs(request.param), Limits()))
     session.insert(*BATCHES[:CHECKPOINT])
     session.keeper.checkpoint(session.map_solver.dump(), 0.0)
     session.insert(*BATCHES[CHECKPOINT:INSERTS])
@@ -127,8 +128,8 @@ def rounding_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last number of every step is rounded as another processor might."""
     true_step = Solver.step
 
-    def step(solver: Solver, settle: bool = False) -> Any:
-        report = true_step(solver, settle)
+    def step(solver: Solver, settle: bool = False, budget: float | None = None) -> Any:
+        report = true_step(solver, settle, budget)
         last = int(graph_in(solver).counts[at.VALUES]) - 1
         graph_in(solver).values[last] = np.nextafter(graph_in(solver).values[last], 9.0)
         return report

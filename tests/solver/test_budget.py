@@ -220,6 +220,48 @@ def test_a_step_that_settles_has_no_budget() -> None:
     assert report.chi2 == pytest.approx(batch_chi2(batches), rel=1e-6)
 
 
+@pytest.mark.parametrize("budget", [1e7, 1e8])
+@pytest.mark.parametrize("world", WORLDS)
+def test_further_steps_with_a_budget_finish_what_was_left(world: str, budget: float) -> None:
+    """As a service gives them: one of no use is followed by one that may take twice as much, or that has no bound."""
+    batches, solver, doubled = list(WORLDS[world](1)), Solver(), 0
+    for batch in batches:
+        solver.stage(batch)
+        last = solver.step(budget=budget)
+    within, complete_at, least, left = [], None, last.chi2, last.unsolved or math.inf
+    for n in range(200):
+        if not solver.unfinished:
+            break
+        report = solver.step(budget=budget * 2.0**doubled if doubled < 7 else 0.0)
+        if report.budget and not tree_of(solver).raised:
+            within.append(report.work / report.budget)
+        if complete_at is None and report.complete:
+            complete_at = n
+        useful = report.chi2 < least * (1.0 - 1e-7) or (report.budget > 0.0 and report.unsolved < 0.99 * left)
+        least, left = min(least, report.chi2), min(left, report.unsolved or math.inf)
+        doubled = 0 if useful else doubled + 1
+    assert not solver.unfinished
+    assert solver.complete
+    assert complete_at is not None
+    assert max(within) < 2.0
+    if world != "robots" and budget < 1e8:
+        assert sum(share > 0.5 for share in within) > 1, "more than one step was needed"
+    free = Solver()
+    for batch in batches:
+        free.stage(batch)
+        free.step()
+    assert solver.chi2() <= free.step(settle=True).chi2 * (1.0 + 1e-6) + 1e-9
+
+
+def test_a_budget_of_the_options_is_none_of_a_step_with_nothing_new() -> None:
+    solver = Solver(Options(step_budget=1e6))
+    for batch in list(WORLDS["streets"](12))[:300]:
+        solver.stage(batch)
+        solver.step()
+    assert solver.step().budget == 0.0
+    assert solver.step(budget=1e6).budget == 1e6
+
+
 def test_changes_in_the_middle() -> None:
     """Factors go while parts of the map are behind: the map ends where one ends that never had them."""
     batches, rng = list(WORLDS["streets"](10)), np.random.default_rng(10)

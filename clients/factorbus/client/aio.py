@@ -106,9 +106,11 @@ class Bus:
         """What each service counts and times.  Raises Refused, Unavailable."""
         return await asyncio.to_thread(self._bus.stats)
 
-    async def create(self, name: str, mode: str = "auto", *, closures: str | None = None) -> MapRow:
-        """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName."""
-        return await asyncio.to_thread(self._bus.create, name, mode, closures=closures)
+    async def create(
+        self, name: str, mode: str = "auto", *, closures: str | None = None, budget_ms: float | None = None
+    ) -> MapRow:
+        """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName, NotSupported."""
+        return await asyncio.to_thread(self._bus.create, name, mode, closures=closures, budget_ms=budget_ms)
 
     async def fork(self, name: str, target: str) -> MapRow:
         """A new map that begins as `name` is now.  Raises as `factorbus.client.Bus.fork`."""

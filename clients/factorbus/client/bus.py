@@ -19,7 +19,7 @@ from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
 from factorbus.proto.interest import Interest, checked_interest
 from factorbus.proto.limits import ANSWER_LIMITS
-from factorbus.proto.problems import BadOption, Problem, Refused, UnknownMap
+from factorbus.proto.problems import BadOption, NotSupported, Problem, Refused, UnknownMap
 
 _LIST_S = 2.0  # to ask for the names of maps, where one was asked for that is not there
 
@@ -84,6 +84,7 @@ class Bus:
         it is there.  client: who inserts into this map, where one connection is used for several; empty: that of
         `connect`.  interest: mirror these variables alone, at its rate; `insert` does not wait until they are there.
         closures: "trust" or "test", what becomes of its loop closures (None: as the service has it for new maps).
+        Its steps have the budget that the service has for new maps; `create` it first for another.
         Raises Refused, Unavailable, BadName, BadOption, UnknownKind, UnknownMap, NotSupported.
         """
         keys.checked_name("map", name)
@@ -157,15 +158,27 @@ class Bus:
         return [codec.decode_map(each) for each in told]
 
     def create(
-        self, name: str, mode: str = "auto", timeout_s: float | None = None, *, closures: str | None = None
+        self,
+        name: str,
+        mode: str = "auto",
+        timeout_s: float | None = None,
+        *,
+        closures: str | None = None,
+        budget_ms: float | None = None,
     ) -> MapRow:
-        """Create map `name`, or find it as it is if its mode is the same, and its policy for loop closures.
+        """Create map `name`, or find it as it is if its mode is the same, and so are the others where they are given.
 
-        closures: "trust" or "test"; None: that of a map which is there, or what the service has for new ones.
-        Raises Refused, Unavailable, BadName.
+        closures: "trust" or "test", what becomes of its loop closures.  budget_ms: what a step of it may take, in
+        milliseconds; what does not fit follows in later steps; 0: there is no bound.  None of either: that of a map
+        which is there, or what the service has for new ones.
+        Raises Refused, Unavailable, BadName, NotSupported.
         """
-        asked = {"map": keys.checked_name("map", name), "mode": mode}
-        return self._admin("create", asked if closures is None else asked | {"closures": closures}, _row, timeout_s)
+        asked = {"map": keys.checked_name("map", name), "mode": mode, "closures": closures, "budget_ms": budget_ms}
+        given = {field: value for field, value in asked.items() if value is not None}
+        row = self._admin("create", given, _row, timeout_s)
+        if budget_ms and row.budget_ms != budget_ms:  # who knows of none skips the field
+            raise NotSupported("a map whose steps have a budget", str(row.protocol.get("product", "")))
+        return row
 
     def fork(self, name: str, target: str, timeout_s: float | None = None) -> MapRow:
         """A new map `target` that begins as map `name` is now: a what-if, which may be tried out and dropped.
@@ -271,4 +284,6 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         reproducible=fields.flag(where, content, "reproducible") if "reproducible" in content else None,
         reason=fields.text(where, content, "reason", default=""),
         closures=fields.text(where, content, "closures", default="trust"),
+        budget_ms=fields.number(where, content, "budget_ms") if "budget_ms" in content else 0.0,
+        complete=fields.flag(where, content, "complete", True),
     )

@@ -15,7 +15,8 @@ class MapRow:
     list of maps.  converged: its last step had; None: the service does not say.  converging: it takes further steps by
     itself, unless an insert comes.  reproducible: as far as is known, its journal gives the same estimate again to the
     bit; if not, `reason` says why; None: it has no journal, or the service does not say.  closures: "test" where loop
-    closures are tested when they come.
+    closures are tested when they come.  budget_ms: what a step of it may take; 0: there is no bound.  complete: the
+    last step left nothing for later ones.
     """
 
     name: str
@@ -32,3 +33,5 @@ class MapRow:
     reproducible: bool | None = None
     reason: str = ""
     closures: str = "trust"
+    budget_ms: float = 0.0
+    complete: bool = True

@@ -21,6 +21,7 @@ from factorbus.viz.ellipses import outlines
 from factorbus.viz.geometry import Track, feature_rays, points_of, segments_of, track_of, view_of
 from factorbus.viz.map_follower import Look
 from factorbus.viz.viewer_process import Viewer
+from factorbus.wording import counted
 
 _LETTER_BITS = 56
 _POSITIONS_PER_S = 100_000  # what the whole map may add to a recording
@@ -104,6 +105,9 @@ class LiveView:
         if "strategy" in delta.report:  # that of a part of the map says less
             text = f"{delta.report.get('strategy', '')}: {delta.report.get('because', '')}"
             text += "; converging: further steps follow" if delta.report.get("converging") is True else ""
+            if delta.report.get("complete") is False:
+                deferred = counted(int(delta.report.get("deferred_relinearizations", 0)), "relinearization")
+                text += f"; {deferred} and more left for later steps"
             far = delta.report.get("converged") is False
             self._to.log("log", rr.TextLog(text, level="WARN" if far else "INFO"))
 

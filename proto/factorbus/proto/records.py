@@ -7,6 +7,7 @@ A place in a journal is the number of a record and the chain (16 bytes) that its
 Every reader raises BadMessage, TooLarge.
 """
 
+import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -53,13 +54,15 @@ class SentInsert(NamedTuple):
 class SentRecord(NamedTuple):
     """What a journal has of one batch: its inserts in order, and the revision that came of it.
 
-    further: a step without an insert.  rebuilt: the solver was replaced meanwhile.
+    further: a step without an insert.  rebuilt: the solver was replaced meanwhile.  budget: what each of its steps
+    might take, in units of the solver's work; 0: they had no bound.
     """
 
     revision: int
     inserts: tuple[SentInsert, ...]
     further: bool = False
     rebuilt: bool = False
+    budget: float = 0.0
 
 
 class RecordsPush(NamedTuple):
@@ -164,7 +167,8 @@ def _place(where: str, content: fields.Map) -> JournalPlace:
 
 def _row(record: SentRecord) -> list[Any]:
     flags = _FURTHER * record.further + _REBUILT * record.rebuilt
-    return [record.revision, flags, [_columns(insert) for insert in record.inserts]]
+    row = [record.revision, flags, [_columns(insert) for insert in record.inserts]]
+    return [*row, record.budget] if record.budget else row
 
 
 def _columns(insert: SentInsert) -> list[Any]:
@@ -208,10 +212,21 @@ def _records(content: fields.Map, digest_of: Callable[[bytes], int], limits: Mes
 def _record(n: int, row: Any, digest_of: Callable[[bytes], int]) -> SentRecord:
     where = f"records.records[{n}]"
     match row:
-        case [int(revision), int(flags), [*inserts]] if revision >= 0 and 0 <= flags <= _FURTHER + _REBUILT:
+        case [int(revision), int(flags), [*inserts], *budget] if revision >= 0 and 0 <= flags <= _FURTHER + _REBUILT:
             sent = tuple(_insert(f"{where}[2][{k}]", each, digest_of) for k, each in enumerate(inserts))
-            return SentRecord(revision, sent, bool(flags & _FURTHER), bool(flags & _REBUILT))
-    raise BadMessage(where, "is something else", "[revision, flags, inserts]")
+            return SentRecord(revision, sent, bool(flags & _FURTHER), bool(flags & _REBUILT), _budget(where, budget))
+    raise BadMessage(where, "is something else", "[revision, flags, inserts], and budget where there was one")
+
+
+def _budget(where: str, columns: list[Any]) -> float:
+    match columns:
+        case []:
+            return 0.0
+        case [float(budget)] if 0.0 < budget < math.inf:
+            return budget
+    raise BadMessage(
+        f"{where}[3]", "is something else", "what each step might take, a number above 0, and nothing more"
+    )
 
 
 def _insert(where: str, row: Any, digest_of: Callable[[bytes], int]) -> SentInsert:

@@ -11,13 +11,25 @@ _COUNTS = (
     "points", "removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables",
     "placed_variables", "added_factors", "deferred_relinearizations",
 )  # fmt: skip
-_NUMBERS = ("chi2", "chi2_before", "damping", "step_ms", "solver_ms", "compiled_ms", "unsolved", "work", "budget")
+_NUMBERS = (
+    "chi2",
+    "chi2_before",
+    "damping",
+    "step_ms",
+    "solver_ms",
+    "compiled_ms",
+    "unsolved",
+    "work",
+    "budget",
+    "budget_ms",
+)
 
 
 class Report(dict[str, Any]):
     """A map that is open: fields of later services are in it, and asking for a documented one never fails.
 
-    One that is not reported is "", 0, NaN, False or an empty map, by its type; `in` and `get` say whether it was.
+    One that is not reported is "", 0, NaN, False or an empty map, by its type, and `complete` is True, since only a
+    step with a budget leaves anything for later; `in` and `get` say whether it was.
     """
 
     def __missing__(self, name: str) -> Any:
@@ -29,6 +41,8 @@ class Report(dict[str, Any]):
             return math.nan
         if name in ("converged", "converging"):
             return False
+        if name == "complete":
+            return True
         if name == "phases_ms":
             return {}
         raise KeyError(name)

@@ -10,6 +10,7 @@ from factorbus.journal.problems import JournalDamaged, JournalUnreadable, Journa
 # 2: the answer to what was accepted was not kept whole; 3: its header had no seal; 4: a checkpoint counted only for the
 # build of the solver that wrote it; 5: checkpoints were called snapshots, in the database and in names of files
 FORM = 6
+FORM_WITH_BUDGETS = 7  # the same, and some of its records have a budget, which are in a table of their own
 APPLICATION = 0x46427573  # "FBus"
 _LOG_BYTES = 64 << 20  # what a log that was longer is cut to, once it is in the database
 # Ways to open it for reading.  The last: where no file can be made beside it, which the log of a database needs.
@@ -102,8 +103,8 @@ def _check_form(path: Path, connection: sqlite3.Connection) -> None:
     (form,) = connection.execute("PRAGMA user_version").fetchone()
     if application != APPLICATION:
         raise JournalDamaged(path, "it is a database of something else")
-    if form != FORM:
-        raise JournalVersion(path, form, FORM)
+    if form not in (FORM, FORM_WITH_BUDGETS):
+        raise JournalVersion(path, form, FORM_WITH_BUDGETS)
 
 
 def _is_writable(path: Path, connection: sqlite3.Connection) -> bool:

@@ -33,6 +33,7 @@ class JournalRecord(NamedTuple):
 
     number: 1, 2, 3, ...   rebuilt: the solver failed meanwhile and was replaced   chain: a digest of every value that
     ever changed, up to here   further: a step without an insert, since the one before had not converged
+    budget: what each of its steps might take, in units of the solver's work; 0: they had no bound
     """
 
     number: int
@@ -41,6 +42,7 @@ class JournalRecord(NamedTuple):
     chain: bytes
     entries: tuple[Entry, ...]
     further: bool = False
+    budget: float = 0.0
 
 
 class Maker(NamedTuple):

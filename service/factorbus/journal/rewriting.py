@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from factorbus.journal.budgets import delete_budgets
 from factorbus.journal.records import JournalRecord, Last, Maker
 from factorbus.journal.store import Store, text_of_build
 
@@ -34,6 +35,7 @@ def rewrite(
         database.execute("DELETE FROM checkpoint WHERE record > ?", (after,))
         database.execute("DELETE FROM entry WHERE record > ?", (after,))
         database.execute("DELETE FROM record WHERE number > ?", (after,))
+        delete_budgets(database, after)
         database.execute("DELETE FROM maker WHERE record > ?", (after,))
         store._insert_records(records)
         _add_maker(store, Maker(after + 1, build))

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from factorbus.journal import chain
+from factorbus.journal.budgets import delete_budgets, insert_budgets, select_records
 from factorbus.journal.connecting import APPLICATION, FORM, connected, connection_to, what_reading_failed_with
 from factorbus.journal.digest import digest_of
 from factorbus.journal.faults import list_faults
@@ -86,8 +87,7 @@ class Store:
                 f"SELECT record, {_ENTRY}, message FROM entry WHERE record > ? ORDER BY number", (after,)
             )
             row = entries.fetchone()
-            for record in self._db.execute("SELECT * FROM record WHERE number > ? ORDER BY number", (after,)):
-                number, revision, rebuilt, digest = record
+            for number, revision, kind, digest, budget in select_records(self._db, after):
                 if number != after + 1:
                     raise JournalDamaged(self.path, f"record {after + 1} is missing")
                 after, taken = number, []
@@ -96,7 +96,8 @@ class Store:
                     row = entries.fetchone()
                 if row is not None and row[0] < number:
                     raise JournalDamaged(self.path, f"an insert of record {row[0]} is out of order")
-                yield JournalRecord(number, revision, rebuilt == _REBUILT, digest, tuple(taken), rebuilt == _FURTHER)
+                rebuilt, further = kind == _REBUILT, kind == _FURTHER
+                yield JournalRecord(number, revision, rebuilt, digest, tuple(taken), further, budget)
             if row is not None:
                 raise JournalDamaged(self.path, f"an insert belongs to record {row[0]}, which is missing")
 
@@ -181,6 +182,7 @@ class Store:
         with self._writing():
             self._db.execute("DELETE FROM entry WHERE record > ?", (record,))
             self._db.execute("DELETE FROM record WHERE number > ?", (record,))
+            delete_budgets(self._db, record)
             self._db.execute("DELETE FROM epoch WHERE record > ?", (epoch.record,))
             self._db.execute("DELETE FROM maker WHERE record > ?", (record,))
             self._add_epoch(epoch)
@@ -280,6 +282,7 @@ class Store:
     def _insert_records(self, records: Sequence[JournalRecord]) -> None:
         rows = [(record.number, record.revision, _kind(record), record.chain) for record in records]
         self._db.executemany("INSERT INTO record VALUES (?, ?, ?, ?)", rows)
+        insert_budgets(self._db, records)
         self._db.executemany(
             f"INSERT INTO entry (record, {_ENTRY}, message) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [(record.number, *entry) for record in records for entry in record.entries],

@@ -46,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--journal", metavar="DIR", help="keep maps here, across restarts and crashes")
     parser.add_argument("--durability", choices=DURABILITIES, help="what an answer promises: see service/README.md")
     parser.add_argument("--closures", choices=CLOSURE_POLICIES, help="of new maps: believe loop closures, or test them")
+    parser.add_argument("--budget-ms", type=float, metavar="MS", help="of new maps: what a step may take; 0: no bound")
     parser.add_argument("--standby", action="store_true", help="wait until the journal's owner is gone, and take over")
     parser.add_argument("--upstream", metavar="ENDPOINT", help="be a replica of the service there")
     parser.add_argument("--upstream-zenoh", metavar="FILE", help="Zenoh configuration of the session with it")
@@ -67,6 +68,7 @@ def _config(options: argparse.Namespace) -> Config:
             "journal",
             "durability",
             "closures",
+            "budget_ms",
             "upstream",
             "upstream_zenoh",
         )

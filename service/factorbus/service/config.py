@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
+from factorbus.proto.budget import BUDGET_SPAN_MS, BUDGET_WANTED
 from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.keys import checked_name
@@ -84,6 +85,7 @@ class Config:
     closures: str = (
         "trust"  # of maps that are new here, unless the client that creates one says otherwise: trust or test
     )
+    budget_ms: float = 0.0  # likewise: what a step of such a map may take; 0: it has no bound
     zenoh: str = ""
     insecure: bool = False
     warm: bool = True  # compile every kernel before taking the first insert
@@ -140,6 +142,8 @@ def checked_config(config: Config) -> Config:
         raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
     if config.closures not in CLOSURE_POLICIES:
         raise BadConfig(f"closures is {config.closures!r}; wanted {' or '.join(CLOSURE_POLICIES)}")
+    if not BUDGET_SPAN_MS[0] <= config.budget_ms <= BUDGET_SPAN_MS[1]:
+        raise BadConfig(f"budget_ms is {config.budget_ms:g}; wanted {BUDGET_WANTED}")
     if config.durability not in DURABILITIES:
         raise BadConfig(f"durability is {config.durability!r}; wanted {', '.join(DURABILITIES)}")
     if config.standby and not config.journal:

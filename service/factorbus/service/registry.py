@@ -4,9 +4,7 @@ Made and dropped on the control thread only; what is on disk is opened before it
 """
 
 import logging
-import secrets
 import threading
-import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,8 +19,9 @@ from factorbus.service.bus.zenoh_session import MapPlace, ServiceBus
 from factorbus.service.config import Config
 from factorbus.service.core.events import Asker, Read
 from factorbus.service.core.map_state import MapCore
-from factorbus.service.journal.library import CopiedAt, Kept, Library, closure_policy_of, make_map_solver, restored
+from factorbus.service.journal.library import CopiedAt, Kept, Library, made_as_of
 from factorbus.service.maps.host import Host
+from factorbus.service.maps.making import MapMaker
 from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.process.heap import give_back
 from factorbus.service.process.memory import MemoryLimit, OutOfMemory
@@ -30,6 +29,7 @@ from factorbus.service.questions.admin import (
     Drop,
     Fork,
     KeptElsewhere,
+    MadeAs,
     MapExists,
     NotDamaged,
     NotHere,
@@ -43,6 +43,7 @@ from factorbus.service.solving.apply import MapSolver
 
 log = logging.getLogger(__name__)
 
+_WHICHEVER = MadeAs()
 _STATES = {"journal_damaged": "damaged", "journal_differs": "differs", "journal_version": "other_version"}
 
 
@@ -79,6 +80,7 @@ class Maps:
         self._forks: dict[str, Fork] = {}  # what maps were forked from, since this service began
         self._stopping = False
         self._inline_run = threading.Lock()  # of the one callback that may solve
+        self._maker = MapMaker(config, library)
 
     def get(self, name: str) -> OpenMap | None:
         """Map `name`, if it is here."""
@@ -115,7 +117,7 @@ class Maps:
         for name in self._library.names() if self._library else []:
             if ours(self._config.maps, name):
                 try:
-                    self._maps[name] = self._make(name, None)
+                    self._maps[name] = self._make(name)
                 except Problem as problem:
                     log.error("map %s does not come back: %s", name, problem)
                     self._unopened[name] = problem
@@ -132,7 +134,7 @@ class Maps:
             if self._stopping:
                 raise ShuttingDown
             try:
-                self._open(name, self._make(name, None))
+                self._open(name, self._make(name))
             except Problem as problem:
                 log.error("map %s, new on disk, does not open: %s", name, problem)
                 self._unopened[name] = problem
@@ -157,22 +159,22 @@ class Maps:
             found.place.announce()
             found.host.created()
 
-    def create(self, name: str, mode: str | None, closures: str = "") -> dict[str, Any]:
-        """The row of map `name`, made if it is not there.  mode: None, closures: "" for whichever.  Raises Problem."""
+    def create(self, name: str, asked: MadeAs = _WHICHEVER) -> dict[str, Any]:
+        """The row of map `name`, made if it is not there.  Raises Problem."""
+        asked = asked._replace(mode=asked.mode and settled_mode(asked.mode))
         if found := self._maps.get(name):
-            core = found.host.core
-            check_made_as(name, (core.mode, core.closures), mode and settled_mode(mode), closures)
-            return core.row()
+            check_made_as(name, made_as_of(found.host.core.mode, found.options), asked)
+            return found.host.core.row()
         if not ours(self._config.maps, keys.checked_name("map", name)):
             raise NotHere(name, self._config.maps)
         self._check_room()
-        return self._open(name, self._make(name, settled_mode(mode or "auto"), closures))
+        return self._open(name, self._make(name, asked))
 
     def create_all(self, names: Iterable[str]) -> None:
         """Have maps of these names; one that is on disk and does not open keeps the others from nothing."""
         for name in names:
             if name not in self._unopened:
-                self._control.do(self.create, name, None)  # clients, which are heard by now, may ask for it as well
+                self._control.do(self.create, name)  # clients, which are heard by now, may ask for it as well
 
     def fork(self, asker: Asker, fork: Fork) -> None:
         """Have a new map begin as another one is, and answer with its row: `forked` goes on.  Raises Problem."""
@@ -268,9 +270,11 @@ class Maps:
         for found in self._maps.values():
             found.place.close()
 
-    def _make(self, name: str, mode: str | None, closures: str = "") -> OpenMap:
-        """mode: None, closures: "" for those of the map which is there.  Raises Problem."""
-        return self._at_work(*self._begin(name, mode, closures))
+    def _make(self, name: str, asked: MadeAs = _WHICHEVER) -> OpenMap:
+        """Raises Problem."""
+        if problem := self._unopened.get(name):
+            raise problem
+        return self._at_work(*self._maker.begin(name, asked))
 
     def _at_work(self, core: MapCore, map_solver: MapSolver, kept: Kept | None) -> OpenMap:
         name = core.name
@@ -285,23 +289,6 @@ class Maps:
         by.interests = self._delivery.interests.of_map(name, place, host.read)
         made = OpenMap(host, place, options)
         return made
-
-    def _begin(self, name: str, mode: str | None, closures: str) -> tuple[MapCore, MapSolver, Kept | None]:
-        """What a map is made of, as it was or new.  Raises Problem."""
-        limits, library, now = self._config.limits, self._library, time.monotonic()
-        if problem := self._unopened.get(name):
-            raise problem
-        if library is not None and library.has(name):
-            kept = library.open(name, limits, mode, closures)
-        elif library is not None:
-            kept = library.make(name, mode or settled_mode("auto"), limits, closures or self._config.closures)
-        else:
-            epoch, mode = secrets.randbits(62) | 1, mode or settled_mode("auto")
-            made = make_map_solver(mode, {"closures": closures or self._config.closures}, epoch, limits)
-            return MapCore(name, mode, epoch, limits, now, closure_policy_of(made.options())), made, None
-        core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now, closure_policy_of(kept.header.options))
-        kept.restore(core)
-        return core, kept.map_solver, kept
 
     def _open(self, name: str, made: OpenMap) -> dict[str, Any]:
         """A map is made: let others see it.  Its row."""
@@ -351,19 +338,8 @@ class Maps:
             raise OutOfMemory(self._memory.resident, self._memory.limit, copied.bytes)
         if found is None or found.host.core.epoch != asked.epoch:
             raise UnknownMap(fork.source)
-        limits, was, now = self._config.limits, found.host.core, time.monotonic()
-        kept = None
-        if self._library is not None:
-            copy = CopiedAt(taken.record, copied.state, was.differs or "")
-            kept = self._library.fork(fork.source, fork.target, copy, limits)
-            epoch, map_solver = kept.header.epoch, kept.map_solver
-        else:
-            epoch = secrets.randbits(62) | 1
-            map_solver = make_map_solver(was.mode, found.options, epoch, limits)
-            map_solver.load(copied.state)
-        core = MapCore(fork.target, was.mode, epoch, limits, now, was.closures)
-        core.restore((), restored(map_solver, was.differs))
-        return self._at_work(core, map_solver, kept)
+        copy = CopiedAt(taken.record, copied.state, found.host.core.differs or "")
+        return self._at_work(*self._maker.fork(fork, found.host.core, found.options, copy))
 
     def _dropped(self, asker: Asker, found: OpenMap) -> None:
         name = found.host.core.name

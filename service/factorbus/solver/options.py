@@ -34,7 +34,8 @@ class Options:
     step_budget     bayes-tree: what a step with something new may take, in units of which 10⁸ are about a millisecond
                     (MATH §9.10); 0: there is no bound.  New variables and factors are always eliminated, whatever that
                     takes; relinearization, what is far from the newest pose, and Levenberg-Marquardt where χ² rose wait
-                    for later steps where they do not fit.  A step with nothing new, or that settles, has no bound
+                    for later steps where they do not fit.  A step with nothing new, or that settles, has no bound;
+                    that with nothing new has one where it is given it, `Solver.step(budget=...)`
     batch_tolerance all-batch: an ordinary step stops when the next one would lower χ² by less than this share of it
     incremental_tolerance   inc-l: the same, and a first step that would is not made.  The paper's tol, with the length
                     of δ measured in standard deviations: |δ|² = δᵀΛδ = dᵀd ≤ tol χ²  (MATH §8.5)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-_OF_A_BUDGET = ("deferred_relinearizations", "unsolved", "work", "budget")
+_OF_A_BUDGET = ("deferred_relinearizations", "unsolved", "work", "budget", "complete")
 _NONE: Mapping[str, float] = MappingProxyType({})
 
 
@@ -34,6 +34,7 @@ class StepReport(NamedTuple):
     deferred_relinearizations, unsolved   of a step with a budget, else 0: variables that are due to be relinearized in
                  a later step; what χ² may be above the optimum: what `converged` goes by, and what was left behind
     work, budget what it took and what it might take, in the units of `Options.step_budget`; 0: it had no bound
+    complete     nothing was left for later steps, neither to be relinearized nor by back-substitution
     """
 
     mode: str
@@ -59,6 +60,7 @@ class StepReport(NamedTuple):
     unsolved: float = 0.0
     work: float = 0.0
     budget: float = 0.0
+    complete: bool = True
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""

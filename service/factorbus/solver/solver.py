@@ -74,16 +74,15 @@ class Solver:
     def step(self, settle: bool = False, budget: float | None = None) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
 
-        budget: in the place of `Options.step_budget`, for this step, and of its range.
+        budget: in the place of `Options.step_budget`, for this step, and of its range; also where nothing is staged.
 
         Raises BadOption; or Underconstrained or NotFinite, and what was staged since the last step is taken back then,
         and the solver is as it was after that step, bit for bit.
         """
         if budget is None:
-            budget = self._options.step_budget
-        else:
-            check_number("step_budget", budget)
-        return self._stepper.step(settle, budget)
+            return self._stepper.step(settle, self._options.step_budget)
+        check_number("step_budget", budget)
+        return self._stepper.step(settle, budget, always=True)
 
     def estimate(self) -> list[Group]:
         """A copy of all values: per kind, in insertion order, fixed variables in groups of their own.
@@ -116,6 +115,11 @@ class Solver:
         That is so where a step has not converged, and also by as much as one that has leaves undone.
         """
         return self._stepper.unfinished
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones, as one with a budget may."""
+        return self._stepper.complete
 
     def convertible(self, below: float) -> I64:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""

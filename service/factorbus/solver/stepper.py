@@ -10,9 +10,15 @@ from factorbus.solver.report import StepReport
 class Stepper(Protocol):
     """Solves for what is new in a graph, step by step: `bayes_tree.steps` and `inc_l.steps`."""
 
-    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
-        """Solve for what is new; with `settle` until it has converged, else within `budget`, as `Options.step_budget`.
+    def step(self, settle: bool, budget: float = 0.0, always: bool = False) -> StepReport:
+        """Solve for what is new; with `settle` until it has converged, else within `budget`, as `Options.step_budget`,
+        and with `always` also where nothing is new.
         Raises Underconstrained, NotFinite; what is new is taken back then, and all is as it was, bit for bit."""
+        ...
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones."""
         ...
 
     def resume(self, settle: bool) -> StepReport:

@@ -63,7 +63,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     aligning   two maps into one frame, of candidates of which most are false: how often right, wrong, left open;
                --draws, --only
     budget     steps with a budget beside the same steps without one: their time, χ² meanwhile, the newest pose, steps
-               until nothing is left for later; --only, --poses, --budget-ms
+               until nothing is left for later; --only, --poses, --budget-ms; --bus: clients of a service
     closures   false loop closures, online: streets with shares of false ones (random, local, grouped), tested as they
                come, beside the same solver without a test and with Huber, Cauchy and DCS losses; half an hour
                without the others, hours with; --draws, --only, --shares, --rivals

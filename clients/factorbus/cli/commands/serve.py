@@ -48,6 +48,12 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
     type=click.Choice(("trust", "test")),
     help="Of new maps: believe loop closures, or test each when it comes.  [default: trust]",
 )
+@click.option(
+    "--budget-ms",
+    type=float,
+    metavar="MS",
+    help="Of new maps: what a step may take; the rest follows in later steps.  [default: 0, no bound]",
+)
 @click.option("--standby", is_flag=True, default=None, help="Wait until the journal's owner is gone, and take over.")
 @click.option("--name", metavar="NAME", help="Of this service, as the bus sees it.  [default: made up]")
 @click.option("--warm/--no-warm", default=None, help="Compile every kernel before the first insert.  [default: warm]")
@@ -68,6 +74,7 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
     factorbus serve
     factorbus serve --listen tls/0.0.0.0:7447 --zenoh service.json5 --map warehouse
     factorbus serve --journal /var/lib/factorbus
+    factorbus serve --budget-ms 10
     factorbus serve --config /etc/factorbus/serve.toml
     factorbus serve --journal /var/lib/factorbus --map yard --upstream tcp/base:7447 --name robot1
 
@@ -111,7 +118,7 @@ def _settings(path: Path | None, given: dict[str, Any]) -> Any:
 
     from factorbus.service.config import Config, checked_config, load_config, needs_journal
 
-    given = {name: value for name, value in given.items() if value not in (None, ())}
+    given = {name: value for name, value in given.items() if value is not None and value != ()}
     if path is None:
         config = checked_config(replace(Config(), **given))
     else:

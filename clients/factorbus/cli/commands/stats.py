@@ -96,6 +96,7 @@ def _map(row: Mapping[str, Any]) -> str:
         f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
         f"{inserts['busy']} answered busy; {row['waiting']} waiting, {row['parked']} parked; "
         f"{counted(row['clients'], 'client')}",
+        *([budget_line(row["budget"])] if "budget" in row else []),
         *([_closures(row["closure_states"])] if "closure_states" in row else []),
         *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
         *(f"journal {name}: {value}" for name, value in shown_fields(row.get("journal", {}))),
@@ -107,6 +108,21 @@ def _closures(states: Mapping[str, int]) -> str:
     """How many loop closures are in each state."""
     told = ", ".join(f"{count} {state}" for state, count in states.items())
     return f"loop closures are tested: {told}"
+
+
+def budget_line(row: Mapping[str, Any]) -> str:
+    """The budget of a map's steps, and what the last one left."""
+    told = f"the last took {row['step_ms']:.2f} ms and left {left_of(row)}"
+    return f"steps have a budget of {row['budget_ms']:g} ms; {told}; {row['units_per_ms']:.3g} units for a millisecond"
+
+
+def left_of(row: Mapping[str, Any]) -> str:
+    """What a step with a budget left for later ones."""
+    if row["complete"]:
+        return "nothing"
+    deferred = counted(row["deferred_relinearizations"], "relinearization")
+    above = "" if row["unsolved"] is None else f", χ² some {row['unsolved']:.3g} above its optimum"
+    return f"{deferred} and more{above}"
 
 
 def interest_line(row: Mapping[str, Any]) -> str:

@@ -34,6 +34,7 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
       steps/s    steps since the look before; inserts/s: accepted inserts
       step ms    solver's time of a step, mean since the look before
       χ²         converging: left alone, the map goes on by itself to its optimum; gave up: it does not
+      budget     where steps have one: what the last one took of it, and relinearizations left for later ones
       waiting    inserts that are accepted by no step yet, and those parked behind a gap
       interest   a part of a map that clients follow, what its channel carries, and variables that wait for that
       client     those that are there; gone: those that have left, whose inserts are in the map
@@ -98,7 +99,7 @@ def view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType":
 # Columns of each table, the first of which stays; where not all have room the last of these goes first.
 _MATTER = (
     "variables", "revision", "χ²", "step ms", "waiting", "steps/s", "factors", "inserts", "map", "inserts/s", "refused",
-    "suspects",
+    "budget", "suspects",
     "mode", "slots", "in flight", "latency ms", "bytes/s", "at most", "upstream", "rebased", "link", "behind",
 )  # fmt: skip
 _ANY_WIDTH = 10_000
@@ -109,7 +110,7 @@ _Table = tuple[tuple[str, ...], list[tuple[str, ...]]]  # names of columns, rows
 def _maps(seen: dict[str, Any]) -> _Table:
     names = (
         "map", "mode", "variables", "factors", "revision", "steps/s", "inserts/s", "step ms", "χ²", "waiting",
-        "refused", "suspects",
+        "refused", "budget", "suspects",
     )  # fmt: skip
     rows = [
         (
@@ -124,13 +125,25 @@ def _maps(seen: dict[str, Any]) -> _Table:
             f"{row['chi2']:.6g}" + _convergence(row),
             f"{row['waiting']}" + (f" +{row['parked']}" if row["parked"] else ""),
             f"{row['refused']}" + (f", {row['busy']} busy" if row["busy"] else ""),
+            _budget(row),
             _suspects(row),
         )
         for row in seen["maps"]
     ]
+    shown = list(names)
     if not any(row["closure_states"] for row in seen["maps"] if "closure_states" in row):
-        return names[:-1], [row[:-1] for row in rows]  # no map tests closures
-    return names, rows
+        shown.remove("suspects")  # no map tests closures
+    if not any("budget" in row for row in seen["maps"]):
+        shown.remove("budget")
+    places = [names.index(name) for name in shown]
+    return tuple(shown), [tuple(row[place] for place in places) for row in rows]
+
+
+def _budget(row: dict[str, Any]) -> str:
+    if (budget := row.get("budget")) is None:
+        return ""
+    last = f"{budget['step_ms']:.1f} of {budget['budget_ms']:g} ms"
+    return last if budget["complete"] else f"{last}, {budget['deferred_relinearizations']:,} left"
 
 
 def _suspects(row: dict[str, Any]) -> str:

@@ -66,6 +66,7 @@ class Indicators:
                 "refused": stats["inserts"]["refused"],
                 "busy": stats["inserts"]["busy"],
                 **({"closure_states": stats["closure_states"]} if "closure_states" in stats else {}),  # where tested
+                **({"budget": stats["budget"]} if "budget" in stats else {}),  # where steps have one
                 **({"upstream": stats["upstream"]} if "upstream" in stats else {}),  # of a replica
             }
         )

@@ -11,7 +11,7 @@ Reasons and figures: docs/decisions/further-steps.md.
 
 import math
 
-from factorbus.service.core.events import Stepped
+from factorbus.service.core.events import BudgetUse, Stepped
 from factorbus.wording import counted
 
 # Idle is a map whose last step of another sort ended so long ago: one that has not converged goes on, and one that has
@@ -23,6 +23,7 @@ MOST, MOST_S = 10_000, 300.0  # further steps in a row, and the seconds of a cor
 # Without use is a step that does not lower χ² by this share, below the least so far; and one that changes nothing.
 _SHARE, _NOTHING = 1e-7, 1e-12
 _USELESS, _STILL = 20, 3  # steps in a row
+_LESS = 0.01  # by which share a step with a budget has to lessen what is left, where χ² says nothing
 
 
 class Converging:
@@ -39,6 +40,8 @@ class Converging:
         self._busy_at = self._rests_until = -math.inf
         self._spent_s = 0.0
         self._least, self._useless, self._still = math.inf, 0, 0
+        self.in_vain = 0  # further steps in a row that had a budget, and were of no use with it
+        self._complete, self._unsolved = True, math.inf  # of the last step with a budget; the least since
 
     @property
     def converging(self) -> bool:
@@ -51,7 +54,7 @@ class Converging:
 
     def look(self, now: float) -> None:
         """Time went by: has the map been idle for long enough?"""
-        idle_s = POLISH_IDLE_S if self.converged else CONVERGE_IDLE_S
+        idle_s = POLISH_IDLE_S if self.converged and self._complete else CONVERGE_IDLE_S
         self._goes_on = self._goes_on or now - self._busy_at >= idle_s
 
     def began(self, further: bool) -> None:
@@ -82,11 +85,13 @@ class Converging:
         """What was not published did not happen."""
         self._untold = False
 
-    def moved_on(self, converged: bool, unfinished: bool, chi2: float) -> None:
-        """A step of another sort is published."""
+    def moved_on(self, converged: bool, unfinished: bool, chi2: float, use: BudgetUse | None = None) -> None:
+        """A step of another sort is published.  use: of its budget, if it had one."""
         self.converged, self._unfinished, self.gave_up = converged, unfinished or not converged, ""
         self.steps, self._spent_s = 0, 0.0
         self._least, self._useless, self._still = chi2, 0, 0
+        self.in_vain, self._complete = 0, use is None or use.complete
+        self._unsolved = math.inf if use is None else use.unsolved
 
     def went_on(self, stepped: Stepped) -> None:
         """A further step is published: was it of use?"""
@@ -96,10 +101,26 @@ class Converging:
         useful = stepped.chi2 < (1.0 - _SHARE) * self._least - _NOTHING
         if useful:
             self._least = stepped.chi2
+        self._complete = stepped.use is None or stepped.use.complete
+        if stepped.use is not None:
+            self._went_on_within(stepped.use, useful)
+            return
+        self.in_vain, self._unsolved = 0, math.inf
         self._useless = 0 if useful else self._useless + 1
         self._still = self._still + 1 if not stepped.changed else 0
         if self._unfinished and not self.gave_up:
             self.gave_up = self._why_give_up(stepped)
+
+    def _went_on_within(self, use: BudgetUse, useful: bool) -> None:
+        """The same of one with a budget.  χ² of an estimate of which a part is behind says little: what is left does.
+
+        One that was of no use is no reason to give up, but to let the next one take more.
+        """
+        useful = useful or use.unsolved < (1.0 - _LESS) * self._unsolved
+        self._unsolved = min(use.unsolved, self._unsolved)
+        self.in_vain = 0 if useful else self.in_vain + 1
+        if self._unfinished and (self.steps >= MOST or self._spent_s >= MOST_S):
+            self.gave_up = self._too_many()
 
     def _why_give_up(self, stepped: Stepped) -> str:
         if stepped.rebuilt:
@@ -110,6 +131,9 @@ class Converging:
         if self._useless >= _USELESS:
             return f"{counted(self._useless, 'further step')} in a row did not lower χ²"
         if self.steps >= MOST or self._spent_s >= MOST_S:
-            steps = counted(self.steps, "further step")
-            return f"it was not at its optimum after {steps} in a row, which took {self._spent_s:.0f} s of a core"
+            return self._too_many()
         return ""
+
+    def _too_many(self) -> str:
+        steps = counted(self.steps, "further step")
+        return f"it was not at its optimum after {steps} in a row, which took {self._spent_s:.0f} s of a core"

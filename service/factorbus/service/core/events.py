@@ -110,12 +110,23 @@ class Verdict(NamedTuple):
     closures: tuple[MovedClosure, ...] = ()
 
 
+class BudgetUse(NamedTuple):
+    """What a step made of its budget, as its report says."""
+
+    work: float = 0.0
+    budget: float = 0.0
+    deferred_relinearizations: int = 0
+    unsolved: float = 0.0
+    complete: bool = True
+
+
 class Stepped(NamedTuple):
     """The solver made a step; the delta tells of it.
 
     converged, unfinished: if not, or if so, further steps are to follow when no insert does.  changed: how many
     variables; damping: what the next step would begin with.  further: without an insert, because the map was not at its
-    optimum.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.
+    optimum.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.  step_ms: what its budget
+    is for, of solver_ms; use: None where it had none.
     """
 
     revision: int
@@ -129,6 +140,8 @@ class Stepped(NamedTuple):
     damping: float = 0.0
     further: bool = False
     unfinished: bool = False
+    step_ms: float = 0.0
+    use: BudgetUse | None = None
 
 
 class Applied(NamedTuple):
@@ -158,7 +171,7 @@ class Restored(NamedTuple):
     """How a map is that was here before.
 
     differs: why its journal, run again, may give other bits; empty: as far as is known it gives the same; None: it has
-    none.  closures: as `Applied` has it.
+    none.  closures: as `Applied` has it.  complete: the last step left nothing for later ones.
     """
 
     revision: int
@@ -169,6 +182,7 @@ class Restored(NamedTuple):
     unfinished: bool = False
     differs: str | None = None
     closures: Mapping[str, int] | None = None
+    complete: bool = True
 
 
 def reproducible_fields(differs: str | None) -> dict[str, Any]:
@@ -230,7 +244,8 @@ class InsertBatch(NamedTuple):
     """Work for the solver: first answer `reads` from the present revision, then apply `inserts`.
 
     short: most likely done sooner than another thread would have taken it over.  reload: first of all, go back to what
-    the journal has.  further: there are no inserts, and one step is to go on from the last one.
+    the journal has.  further: there are no inserts, and one step is to go on from the last one.  budget: what each step
+    may take, in units of the solver's work; 0: it has no bound.
     """
 
     reads: tuple[Read, ...]
@@ -238,6 +253,7 @@ class InsertBatch(NamedTuple):
     short: bool = False
     reload: bool = False
     further: bool = False
+    budget: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from factorbus.proto.closures import JUDGE
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core.admission import Admission
+from factorbus.service.core.budget import StepBudget
 from factorbus.service.core.closures import asked_outcomes, closures_moved
 from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
@@ -26,6 +27,7 @@ from factorbus.service.core.events import (
     Arrived,
     ArrivedQuestion,
     Asker,
+    BudgetUse,
     Drained,
     Effect,
     Follow,
@@ -43,23 +45,23 @@ from factorbus.service.core.events import (
     reproducible_fields,
 )  # fmt: skip
 from factorbus.service.core.pending_questions import Reads, is_graft
+from factorbus.service.core.short_batches import ShortBatches
 from factorbus.service.core.statistics import InsertDone, MapStatistics
 from factorbus.service.questions.admin import MovedOn
 from factorbus.service.questions.answers import Question, parse
 
 _SNAPSHOT = Read(Question("snapshot"))
-# An InsertBatch is short when it is for one insert of at most _SHORT_BYTES and none of late took longer than SHORT_S,
-# unless the insert was on its way already when the last one ended: then more likely follow, to be applied together.
-_SHORT_BYTES = 16 << 10
-SHORT_S = 0.002
-_ROUND_TRIP_S = 0.0002
 
 
 class MapCore:
     """The state of one map, short of its estimate.  Every method takes an event and returns effects, in order."""
 
-    def __init__(self, name: str, mode: str, epoch: int, limits: Limits, now: float, closures: str = "trust") -> None:
+    def __init__(
+        self, name: str, mode: str, epoch: int, limits: Limits, now: float, closures: str = "trust",
+        budget: StepBudget | None = None,
+    ) -> None:  # fmt: skip
         self.name, self.mode, self.epoch, self.closures = name, mode, epoch, closures
+        self._budget = budget or StepBudget()
         self.revision = self.variables = self.factors = 0
         self.differs: str | None = None  # as `Restored` has it
         self._limits, self._created = limits, now
@@ -69,8 +71,7 @@ class MapCore:
         self._running: InsertBatch | None = None
         self._unanswered = self._unanswered_bytes = 0  # given to the solver, and not answered
         self._must_reload = False
-        self._started = self._ended = 0.0
-        self._slowest_s = math.inf  # of late: forgotten by a tenth with every InsertBatch
+        self._started, self._short = 0.0, ShortBatches()
         self._closing: Problem | None = None
         self._drained = False
         self._since_snapshot = [0, 0]  # steps, bytes of deltas
@@ -92,6 +93,7 @@ class MapCore:
             "state": "blocked" if self._admission.blocked else "open",
             "converged": self._converging.converged,
             "converging": self._converging.converging,
+            **self._budget.row(),
             **reproducible_fields(self.differs),
         }
 
@@ -164,8 +166,9 @@ class MapCore:
         step = stepped.strategy, stepped.chi2, stepped.solver_ms
         self._statistics.note(InsertDone(*step, applied.now - insert.now, len(answer), size))
         self._moved_on(stepped.revision, size)
-        self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2)
+        self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2, stepped.use)
         self._moved_at = stepped.revision
+        self._budget.stepped(stepped)
         self._free(applied, 1)
         return self._go_on(others, applied.now)
 
@@ -203,7 +206,9 @@ class MapCore:
         for name, following, answered in ((*sender,) for sender in senders if sender[0] != JUDGE):
             self._admission.restore(name, following, answered, self._created)
         self.revision, self.variables, self.factors, self._statistics.chi2 = restored[:4]
-        self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2)
+        use = BudgetUse(unsolved=math.inf, complete=restored.complete)
+        self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2, use)
+        self._budget.restore(use)
         self._moved_at, self.differs = restored.revision, restored.differs
         self._statistics.closures = restored.closures
 
@@ -212,10 +217,11 @@ class MapCore:
         size = len(stepped.delta)
         self._statistics.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, size)
         self._moved_on(stepped.revision, size)
+        self._budget.stepped(stepped)
         if stepped.further:
             self._converging.went_on(stepped)
         else:
-            self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2)
+            self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2, stepped.use)
             self._moved_at = stepped.revision
         return [Publish("delta", stepped.delta)]
 
@@ -249,12 +255,12 @@ class MapCore:
         return self._go_on([], applied.now)
 
     def _free(self, applied: Applied, taken: int) -> None:
-        self._running, self._ended = None, applied.now
+        self._running = None
         self._statistics.closures = applied.closures
         self._converging.ended(applied.solver_cpu_s - self._solver_cpu_s, applied.now)
-        seconds = self._ended - self._started
+        seconds = applied.now - self._started
         self._admission.took(taken, seconds)
-        self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
+        self._short.ended(seconds, applied.now)
         self.variables, self.factors, self._solver_cpu_s = applied.variables, applied.factors, applied.solver_cpu_s
 
     def failed(self, problem: Problem, now: float) -> list[Effect]:
@@ -308,6 +314,7 @@ class MapCore:
             "further_steps": self._converging.steps,
             "gave_up": self._converging.gave_up,
             "solver_cpu_s": self._solver_cpu_s,
+            **self._budget.stats(),
             **self._statistics.stats(),
         }
 
@@ -334,8 +341,9 @@ class MapCore:
             if is_graft(reads):  # nothing goes with it
                 room = further = False
             inserts = self._admission.take(limits.step_inserts) if room else ()
-            short = self._is_short(reads, inserts, now)
-            self._running = InsertBatch(reads, inserts, short, self._must_reload, further)
+            short = self._short.is_short(reads, inserts, now)
+            units = self._budget.units(self._converging.in_vain if further else 0)
+            self._running = InsertBatch(reads, inserts, short, self._must_reload, further, units)
             if inserts or further:
                 self._converging.began(further)
             self._must_reload = False
@@ -365,7 +373,7 @@ class MapCore:
             or content.convert_below
             or self._running is not None
             or self._reads
-            or not self._is_quick(arrived.size, arrived.now)
+            or not self._short.is_quick(arrived.size, arrived.now)
         ):
             return None
         if self._must_reload or not self._has_room():
@@ -376,19 +384,8 @@ class MapCore:
         self._converging.began(False)
         self._unanswered += 1
         self._unanswered_bytes += arrived.size
-        self._running = run = InsertBatch((), (arrived,), True)
+        self._running = run = InsertBatch((), (arrived,), True, budget=self._budget.units())
         return run
-
-    def _is_short(self, reads: tuple[Read, ...], inserts: tuple[Arrived, ...], now: float) -> bool:
-        if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
-            return False
-        content = inserts[0].content
-        if isinstance(content, Problem):
-            return True
-        return not (inserts[0].is_change or content.convert_below or content.settle)
-
-    def _is_quick(self, size: int, now: float) -> bool:
-        return size <= _SHORT_BYTES and self._slowest_s <= SHORT_S and now - self._ended >= _ROUND_TRIP_S
 
     def _count_refused(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:

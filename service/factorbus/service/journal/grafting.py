@@ -32,6 +32,8 @@ from factorbus.service.solving.arrival import message_digest, read_again
 
 log = logging.getLogger(__name__)
 
+_FURTHER = SentRecord(0, (), further=True)
+
 
 class Graft(NamedTuple):
     """Put `records` behind `after`.
@@ -119,7 +121,9 @@ def graft_records(
 def _alike(own: Iterable[JournalRecord], sent: Iterable[SentRecord]) -> Iterator[None]:
     """As many as are the same."""
     for mine, other in zip(own, sent, strict=False):
-        if (mine.further, mine.rebuilt, len(mine.entries)) != (other.further, other.rebuilt, len(other.inserts)):
+        if (mine.further, mine.rebuilt, mine.budget) != (other.further, other.rebuilt, other.budget):
+            return
+        if len(mine.entries) != len(other.inserts):
             return
         for entry, insert in zip(mine.entries, other.inserts, strict=True):
             if (entry.client, entry.sequence, entry.outcome) != (insert.client, insert.sequence, insert.outcome):
@@ -166,7 +170,7 @@ class _Grafting:
     def take(self, records: Iterable[SentRecord]) -> None:
         """The other's.  Raises RecordsDiffer where they come to another end, and must not."""
         for sent in records:
-            made = self._apply(tuple(map(_entry_of, sent.inserts)), sent.further, sent.rebuilt)
+            made = self._apply(tuple(map(_entry_of, sent.inserts)), sent)
             for insert, entry in zip(sent.inserts, made.entries, strict=True):
                 if (insert.outcome == ACCEPTED) != (entry.outcome == ACCEPTED):
                     self._same = False
@@ -189,7 +193,7 @@ class _Grafting:
             if not entries and not record.further:
                 continue
             entries = [_again(entry, first if moved else None) for entry in entries]
-            made = self._apply(tuple(entries), record.further, record.rebuilt)
+            made = self._apply(tuple(entries), record)
             self._rebased += 1
             had = {(entry.client, entry.sequence): entry for entry in record.entries}
             for entry in made.entries:
@@ -199,7 +203,7 @@ class _Grafting:
                     self._refused.append(_answered(entry))
         # Who follows the map skips what is not newer than what it has.
         while self.map_solver.revision <= self._published and self.map_solver.size[0]:
-            if self._apply((), True, False).revision == self._before:
+            if self._apply((), _FURTHER).revision == self._before:
                 break
 
     def grafted(self, rebased: bool) -> Grafted:
@@ -219,10 +223,12 @@ class _Grafting:
             self._refused.append(AnsweredInsert(entry.client, entry.sequence, digest, problem))
         return digest is not None
 
-    def _apply(self, entries: tuple[Entry, ...], further: bool, rebuilt: bool) -> JournalRecord:
+    def _apply(self, entries: tuple[Entry, ...], like: JournalRecord | SentRecord) -> JournalRecord:
+        """like: a record of another map, or of this one as it was, by the same steps."""
+        self.map_solver.allow(like.budget)
         inserts = [arrived_again(entry) for entry in entries if entry.outcome != UNTRIED]
-        events = list(self.map_solver.apply_again(inserts, rebuilt, further))
-        made = written(self.last.record + 1, inserts, events, self.last, further)
+        events = list(self.map_solver.apply_again(inserts, like.rebuilt, like.further))
+        made = written(self.last.record + 1, inserts, events, self.last, like.further, like.budget)
         tried = iter(made.entries)
         made = made._replace(entries=tuple(e if e.outcome == UNTRIED else next(tried) for e in entries))
         self._before = self.last.revision
@@ -270,7 +276,7 @@ def sent_records(
         if sent and (size >= most_bytes or len(sent) >= most):
             return tuple(sent), last, True
         inserts = tuple(_sent(entry, named) for entry in record.entries)
-        sent.append(SentRecord(record.revision, inserts, record.further, record.rebuilt))
+        sent.append(SentRecord(record.revision, inserts, record.further, record.rebuilt, record.budget))
         size += sum(len(insert.message) for insert in sent[-1].inserts)
         last = Last(record.number, record.revision, record.chain)
     return tuple(sent), last, False

@@ -17,6 +17,7 @@ class HandedBatch:
     inserts: Sequence[Arrived]
     events: Events
     further: bool
+    budget: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,13 +88,13 @@ class Keeper:
         self._thread.start()
         return problem
 
-    def hand(self, inserts: Sequence[Arrived], events: Events, further: bool = False) -> None:
-        """Write down that `inserts` were applied, and what came of it; of none, a `further` step, which may have been
-        refused."""
+    def hand(self, inserts: Sequence[Arrived], events: Events, further: bool = False, budget: float = 0.0) -> None:
+        """Write down that `inserts` were applied, each step within `budget`, and what came of it; of none, a `further`
+        step, which may have been refused."""
         if inserts or events or further:
             self._number += 1
             self._checkpoint.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
-            self._items.put(HandedBatch(self._number, inserts, events, further))
+            self._items.put(HandedBatch(self._number, inserts, events, further, budget))
 
     def after(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
         """Do `call` when all that was handed in so far is published; `dropped` if it never will be."""
@@ -221,7 +221,7 @@ class Keeper:
         records, last = [], self.last
         for item in batch:
             if isinstance(item, HandedBatch):
-                record = written(item.number, item.inserts, item.events, last, item.further)
+                record = written(item.number, item.inserts, item.events, last, item.further, item.budget)
                 records.append(record)
                 last = Last(record.number, record.revision, record.chain)
         try:

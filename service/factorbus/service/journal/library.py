@@ -18,6 +18,7 @@ from factorbus.journal.lock import Owned, own
 from factorbus.journal.problems import JournalDamaged, JournalOption, NoJournal, NotWritten
 from factorbus.journal.records import Epoch, Header, Maker
 from factorbus.journal.store import NAME, Checkpoint, Last, Store, create, open_store
+from factorbus.proto.budget import BUDGET_OPTION, BUDGET_SPAN_MS, BUDGET_WANTED
 from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.nearest import nearest
 from factorbus.proto.problems import Problem
@@ -26,7 +27,7 @@ from factorbus.service.core.map_state import MapCore, Restored
 from factorbus.service.journal.checkpoint_plan import CheckpointPlan
 from factorbus.service.journal.keeping import Keeper, Listener
 from factorbus.service.journal.recovery import Recovered, answers, recover
-from factorbus.service.questions.admin import check_made_as
+from factorbus.service.questions.admin import MadeAs, check_made_as
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.tested import TestedMapSolver
 from factorbus.solver.build import present_build
@@ -34,12 +35,14 @@ from factorbus.solver.state import FORMAT
 
 log = logging.getLogger(__name__)
 
+_WHICHEVER = MadeAs()
+
 
 def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> MapSolver:
     """A map solver with a new solver in `mode`, and the other settings as `options` has them.  Raises JournalOption.
 
     closures: what becomes of loop closures, one of CLOSURE_POLICIES, is the map solver's own; by default they are
-    trusted.
+    trusted.  budget_ms: what its steps may take; by default they have no bound.
     """
     from factorbus.solver import Options, Solver
     from factorbus.solver.errors import BadOption
@@ -47,6 +50,9 @@ def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: L
     known, options = tuple(Options().as_dict()), dict(options)
     if (closures := options.pop("closures", "trust")) not in CLOSURE_POLICIES:
         raise JournalOption("closures", f"it is {closures!r:.40}; wanted one of {', '.join(CLOSURE_POLICIES)}")
+    own = {}
+    if (budget_ms := options.pop(BUDGET_OPTION, 0.0)) != 0.0:
+        own[BUDGET_OPTION] = _checked_budget(budget_ms)
     for name in options:
         if name not in known:
             raise JournalOption(name, "there is no such option here" + nearest(name, known))
@@ -55,20 +61,35 @@ def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: L
     except BadOption as bad:
         raise JournalOption(str(bad.detail["where"]), bad.message) from None
     if closures == "test":
-        return TestedMapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict() | {"closures": closures})
-    return MapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict())
+        own["closures"] = closures
+        return TestedMapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict() | own)
+    return MapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict() | own)
 
 
-def closure_policy_of(options: Mapping[str, Any]) -> str:
-    """What becomes of loop closures in a map with these settings."""
-    return str(options.get("closures", "trust"))
+def own_options(made_as: MadeAs) -> dict[str, Any]:
+    """The settings of a map that are not its solver's."""
+    return {"closures": made_as.closures or "trust", BUDGET_OPTION: made_as.budget_ms or 0.0}
+
+
+def made_as_of(mode: str, options: Mapping[str, Any]) -> MadeAs:
+    """How a map with these settings was made."""
+    return MadeAs(mode, str(options.get("closures", "trust")), float(options.get(BUDGET_OPTION, 0.0)))
+
+
+def _checked_budget(budget_ms: Any) -> float:
+    """A journal's, if it is one.  Raises JournalOption."""
+    if type(budget_ms) is not float or not BUDGET_SPAN_MS[0] < budget_ms <= BUDGET_SPAN_MS[1]:
+        raise JournalOption(BUDGET_OPTION, f"it is {budget_ms!r:.40}; wanted {BUDGET_WANTED}")
+    return budget_ms
 
 
 def restored(map_solver: MapSolver, differs: str | None = None) -> Restored:
     """How the map in `map_solver` is.  differs: as `Restored` has it."""
     chi2 = map_solver.chi2() if map_solver.revision else 0.0
     done = map_solver.converged, map_solver.unfinished, differs
-    return Restored(map_solver.revision, *map_solver.size, chi2, *done, map_solver.closure_counts())
+    return Restored(
+        map_solver.revision, *map_solver.size, chi2, *done, map_solver.closure_counts(), map_solver.complete
+    )
 
 
 def log_owner(owner: str) -> None:
@@ -109,17 +130,17 @@ class Library:
         """Whether a new map cannot have this name: there is one, or a folder that is something else."""
         return (self._owned.folder / name).exists()
 
-    def make(self, name: str, mode: str, limits: Limits, closures: str = "trust") -> "Kept":
+    def make(self, name: str, made_as: MadeAs, limits: Limits) -> "Kept":
         """A new map, and its journal.  Raises JournalFailed."""
-        where, epoch = self._owned.folder / name, secrets.randbits(62) | 1
-        map_solver = make_map_solver(mode, {"closures": closures}, epoch, limits)
+        where, epoch, mode = self._owned.folder / name, secrets.randbits(62) | 1, made_as.mode or "auto"
+        map_solver = make_map_solver(mode, own_options(made_as), epoch, limits)
         store = create(where, name, mode, map_solver.options(), epoch, self._config.durability)
         return Kept(store, store.header(), map_solver, Recovered(store.last()), self._config)
 
-    def open(self, name: str, limits: Limits, mode: str | None = None, closures: str = "") -> "Kept":
-        """The map `name` as it was, if it was made in that mode with that policy; None, "": whichever.
+    def open(self, name: str, limits: Limits, asked: MadeAs = _WHICHEVER) -> "Kept":
+        """The map `name` as it was, if it was made as it is asked for.
 
-        Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed, OtherMode, OtherClosures.
+        Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed; what `check_made_as` does.
         """
         path = self._owned.folder / name
         try:
@@ -129,7 +150,7 @@ class Library:
         try:
             store.check_form()
             header = store.header()
-            check_made_as(name, (header.mode, closure_policy_of(header.options)), mode, closures)
+            check_made_as(name, made_as_of(header.mode, header.options), asked)
             return _reopened(store, header, limits, self._config)
         except Problem:
             store.close()

@@ -108,6 +108,7 @@ class _History:
     def _apply(self, record: JournalRecord, present: bytes) -> bytes:
         inserts = [arrived_again(entry) for entry in record.entries if entry.outcome != UNTRIED]
         outcomes: dict[tuple[str, int], int] = {}
+        self._map_solver.allow(record.budget)
         for event in self._map_solver.apply_again(inserts, record.rebuilt, record.further):
             if isinstance(event, Verdict):
                 for outcome in event.outcomes:

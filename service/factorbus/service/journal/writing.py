@@ -12,9 +12,11 @@ from factorbus.solver.errors import SolverError
 
 
 def written(
-    number: int, inserts: Sequence[Arrived], events: Sequence[Verdict | Stepped], last: Last, further: bool = False
-) -> JournalRecord:
-    """What is written down of an InsertBatch.  further: it was for a further step, which may have been refused."""
+    number: int, inserts: Sequence[Arrived], events: Sequence[Verdict | Stepped], last: Last, further: bool = False,
+    budget: float = 0.0,
+) -> JournalRecord:  # fmt: skip
+    """What is written down of an InsertBatch.  further: it was for a further step, which may have been refused;
+    budget: what each step of it might take."""
     present, revision, rebuilt = last.chain, last.revision, False
     outcomes: dict[int, tuple[Outcome, Verdict]] = {}
     for event in events:
@@ -25,7 +27,7 @@ def written(
             present, revision = chain.extend_chain(present, event.delta), event.revision
             rebuilt = rebuilt or event.rebuilt
     entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in _with_judged(inserts, events))
-    return JournalRecord(number, revision, rebuilt, present, entries, further and not rebuilt)
+    return JournalRecord(number, revision, rebuilt, present, entries, further and not rebuilt, budget)
 
 
 def _with_judged(inserts: Sequence[Arrived], events: Sequence[Verdict | Stepped]) -> list[Arrived]:

@@ -249,6 +249,7 @@ class Host:
                 return
             if run.reads:
                 self._read(run.reads)
+            self._map_solver.allow(run.budget)
             events = self._map_solver.apply_batch(run.inserts, run.further)
             if not isinstance(events, SingleInsertResult):
                 self._tell(events, tell)
@@ -297,8 +298,9 @@ class Host:
             self._graft(run.reads[0], keeper)
         elif run.reads:
             self._read(run.reads)
+        self._map_solver.allow(run.budget)
         events, applied = self._map_solver.apply_whole(run.inserts, run.further)
-        keeper.hand(run.inserts, events, run.further)
+        keeper.hand(run.inserts, events, run.further, run.budget)
         if not keeper.waits:
             with self._lock:
                 effects = self.core.kept(events, time.monotonic())

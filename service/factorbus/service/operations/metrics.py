@@ -166,6 +166,25 @@ def _of_maps(maps: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
     states = [((m, s), n) for m, row in rows.items() for s, n in row.get("closure_states", {}).items()]
     yield Family("map_closures", "gauge", "Loop closures of maps that test theirs", ("map", "state"), states)
     yield from _extra("journal", "map", {m: row.get("journal", {}) for m, row in rows.items()})
+    yield from _of_budgets({m: row["budget"] for m, row in rows.items() if "budget" in row})
+
+
+_BUDGET_GAUGES = {
+    "budget_ms": "What a step may take",
+    "step_ms": "What the last step took, to which that applies",
+    "deferred_relinearizations": "Variables that later steps are to relinearize",
+    "unsolved": "How far chi2 may be above its optimum, as far as the last step says",
+    "complete": "1 where the last step left nothing for later ones",
+    "units_per_ms": "Units of work that are given for a millisecond",
+}
+
+
+def _of_budgets(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[Family]:
+    """Those of maps whose steps have a budget, if there are any."""
+    for name, what in _BUDGET_GAUGES.items() if rows else ():
+        yield _by(
+            f"map_{name}", "gauge", what, "map", {m: row[name] for m, row in rows.items() if row[name] is not None}
+        )
 
 
 def _extra(chapter: str, label: str, by: Mapping[str, Mapping[str, Any]]) -> Iterator[Family]:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from factorbus.proto import codec, fields
+from factorbus.proto.budget import BUDGET_SPAN_MS, BUDGET_WANTED
 from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import REQUEST_LIMITS
@@ -30,6 +31,32 @@ class OtherClosures(Problem):
             f"map {name!r} has the policy {closures!r} for loop closures, not {wanted!r}, and keeps it; join it with "
             "that, or drop it",
             closures=closures,
+        )
+
+
+class OtherBudget(Problem):
+    """The map is there, and its steps have another budget than asked for."""
+
+    code = "other_budget"
+
+    def __init__(self, name: str, budget_ms: float, wanted: float) -> None:
+        has = f"a budget of {budget_ms:g} ms" if budget_ms else "no budget"
+        super().__init__(
+            f"the steps of map {name!r} have {has}, not {wanted:g} ms, and keep it; join it with that, or drop it",
+            budget_ms=budget_ms,
+        )
+
+
+class NoBudget(Problem):
+    """A map was to be made whose steps have a budget, in a mode in which they cannot have one."""
+
+    code = "no_budget"
+
+    def __init__(self, mode: str) -> None:
+        super().__init__(
+            f"steps in mode {mode} have no budget: they do all there is to do; leave out `budget_ms`, or make the map "
+            "in mode bayes-tree",
+            mode=mode,
         )
 
 
@@ -103,8 +130,19 @@ class Fork(NamedTuple):
     request: int = 0
 
 
-def read_create(payload: bytes) -> tuple[str, str, str]:
-    """(map, mode, closures) of an admin/create; closures "": whichever.
+class MadeAs(NamedTuple):
+    """How a map is made, or asked for.  mode None, closures "", budget_ms None: whichever, of a new one the service's.
+
+    closures: its policy for loop closures.  budget_ms: of its steps; 0: they have no bound.
+    """
+
+    mode: str | None = None
+    closures: str = ""
+    budget_ms: float | None = None
+
+
+def read_create(payload: bytes) -> tuple[str, MadeAs]:
+    """What an admin/create asks for: the map, and how it is to be.
 
     Raises BadMessage, BadOption, BadName, TooLarge.
     """
@@ -112,7 +150,10 @@ def read_create(payload: bytes) -> tuple[str, str, str]:
     mode, closures = fields.choice_of("create", content, "mode", tuple(MODES), "auto"), ""
     if content.get("closures") is not None:
         closures = fields.choice_of("create", content, "closures", CLOSURE_POLICIES, "")
-    return _map_name(content, "create"), mode, closures
+    budget_ms = None
+    if content.get("budget_ms") is not None:
+        budget_ms = fields.parameter("create", content, "budget_ms", BUDGET_SPAN_MS, BUDGET_WANTED, 0.0)
+    return _map_name(content, "create"), MadeAs(mode, closures, budget_ms)
 
 
 class Drop(NamedTuple):
@@ -140,15 +181,23 @@ def read_fork(payload: bytes) -> Fork:
     return Fork(_map_name(content, "fork"), _map_name(content, "fork", "as"), request)
 
 
-def check_made_as(name: str, made_as: tuple[str, str], mode: str | None, closures: str) -> None:
-    """Is map `name`, of that mode and policy, as it is asked for?  None, "": whichever.
+def check_made_as(name: str, made_as: MadeAs, asked: MadeAs) -> None:
+    """Is map `name`, made so, as it is asked for?  Raises OtherMode, OtherClosures, OtherBudget."""
+    if asked.mode not in (None, made_as.mode):
+        raise OtherMode(name, str(made_as.mode), asked.mode)
+    if asked.closures not in ("", made_as.closures):
+        raise OtherClosures(name, made_as.closures, asked.closures)
+    if asked.budget_ms not in (None, made_as.budget_ms):
+        raise OtherBudget(name, made_as.budget_ms or 0.0, asked.budget_ms)
 
-    Raises OtherMode, OtherClosures.
-    """
-    if mode not in (None, made_as[0]):
-        raise OtherMode(name, made_as[0], mode)
-    if closures not in ("", made_as[1]):
-        raise OtherClosures(name, made_as[1], closures)
+
+def settled(asked: MadeAs, closures: str, budget_ms: float) -> MadeAs:
+    """How a new map is made that is asked for so, by a service with these for new maps.  Raises NoBudget."""
+    mode = settled_mode(asked.mode or "auto")
+    if asked.budget_ms and not mode_named(mode).tree:
+        raise NoBudget(mode)
+    own = budget_ms if mode_named(mode).tree else 0.0
+    return MadeAs(mode, asked.closures or closures, own if asked.budget_ms is None else asked.budget_ms)
 
 
 def settled_mode(mode: str) -> str:

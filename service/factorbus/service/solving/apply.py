@@ -145,7 +145,7 @@ class MapSolver(Holding):
         if self._wary or not is_usual(self._solver):
             kept, self._solver, self._wary = self._solver, copied(self._solver), True
         try:
-            report = self._solver.step()
+            report = self._solver.step(budget=self._budget)
             check_step(self._solver, report)
         except SolverError as problem:
             log.warning("a further step, without an insert, is refused; none is tried until the next one: %s", problem)
@@ -217,7 +217,7 @@ class MapSolver(Holding):
                 kept, self._solver, counts = self._solver, copied(self._solver), self._accepted_counts
                 for insert, _ in staged:
                     _, counts = self._stage(insert, counts)
-            report = self._solver.step(settle)
+            report = self._solver.step(settle, self._budget)
         except SolverError as problem:
             self._solver = kept or self._solver
             if len(staged) > 1:

@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from factorbus.proto.budget import BUDGET_OPTION
 from factorbus.proto.closures import Suspects, encode_suspects
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Limits
+from factorbus.service.core.budget import use_of
 from factorbus.service.core.events import Stepped
 from factorbus.service.questions.answers import Copied, Question, QuestionCopies, snapshot
 from factorbus.service.questions.question_memory import Room
@@ -61,6 +63,11 @@ class Holding:
         self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
         self._room = Room()
         self._messages = StepMessages()
+        self._budget: float | None = None  # of every step, as `Solver.step` has it
+
+    def allow(self, budget: float) -> None:
+        """What each step of what is applied next may take, in units of work; 0: as the solver's own settings say."""
+        self._budget = budget or None
 
     def bound(self, room: Room) -> None:
         """Questions may take no more than this."""
@@ -116,6 +123,11 @@ class Holding:
         """Whether a further step would bring the estimate nearer to its optimum."""
         return self._unfinished
 
+    @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones."""
+        return bool(self._solver.complete)
+
     def enter(self, epoch: int) -> None:
         """From now on answers and deltas name this epoch."""
         self._epoch = epoch
@@ -167,8 +179,8 @@ class Holding:
         everything = np.arange(self._solver.variable_count)
         delta = self._messages.write_delta(self._step(0), reported, everything, graph)
         strategy, solver_ms = str(reported.get("strategy", "")), float(reported.get("solver_ms", 0.0))
-        state = {"converged": self._converged, "unfinished": self._unfinished}
-        return Stepped(self._revision, delta, strategy, self.chi2(), solver_ms, **state)
+        made = Stepped(self._revision, delta, strategy, self.chi2(), solver_ms)
+        return made._replace(converged=self._converged, unfinished=self._unfinished)
 
     def memory_bytes(self) -> int:
         """What its solver has in use."""
@@ -190,7 +202,8 @@ class Holding:
         """The last step, which `delta` tells of."""
         reported = self._last_report
         told = reported["strategy"], reported["chi2"], reported["solver_ms"]
-        return Stepped(self._revision, delta, *told, converged=self._converged, unfinished=self._unfinished)
+        made = Stepped(self._revision, delta, *told, converged=self._converged, unfinished=self._unfinished)
+        return made._replace(step_ms=reported["step_ms"], use=use_of(reported)) if "budget" in reported else made
 
     def _next(self, reported: dict[str, Any]) -> None:
         """The solver has made a step: `reported` says, too, whether more are to follow."""
@@ -198,6 +211,8 @@ class Holding:
         self._last_report, self._uncertain = reported, None
         self._converged, self._unfinished = _has_converged(reported), bool(self._solver.unfinished)
         reported["converging"] = self._unfinished or not self._converged
+        if "budget" in reported and (budget_ms := self._options.get(BUDGET_OPTION)):
+            reported["budget_ms"] = budget_ms
 
     def _fault(self) -> str:
         """Log what is being handled; the reference under which it is found."""

@@ -47,7 +47,7 @@ _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimat
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
 _STALLS = "a step with nothing new did not lower χ²: Levenberg-Marquardt to the optimum"
-_NO_BUDGET = (0, 0.0, 0.0, 0.0)
+_NO_BUDGET = (0, 0.0, 0.0, 0.0, True)
 _new = tuple.__new__
 
 
@@ -75,12 +75,12 @@ class TreeSteps:
         """How much of the graph there was after the last step."""
         return self._mark
 
-    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
-        """As `Solver.step`."""
+    def step(self, settle: bool, budget: float = 0.0, always: bool = False) -> StepReport:
+        """As `Solver.step`.  always: the budget is one of a step with nothing new, too."""
         clock = self._options.clock
         started = clock() if clock else 0.0
         tree, because = self._tree, ""
-        bounded = not settle and 0.0 < budget <= MOST_BUDGET
+        bounded = not settle and 0.0 < budget <= MOST_BUDGET and (always or self._has_new)
         if bounded:
             tree.set_budget(budget)
         try:
@@ -98,10 +98,10 @@ class TreeSteps:
         finally:
             if bounded:
                 tree.set_budget(math.inf)
-        bounded = bounded and not tree.state.item(tl.S_CONTINUES)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
-        if not settle and ((bounded and self._is_tolerable) or (not tree.state.item(tl.S_AFTER) and not self._stalls)):
+        stands = not tree.state.item(tl.S_AFTER) and (bounded or not self._stalls)
+        if not settle and (stands or (bounded and self._is_tolerable)):
             self._damping = 0.0
             return self._report(started, compiled, None, because, budget if bounded else 0.0)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
@@ -156,6 +156,16 @@ class TreeSteps:
         if self._at_linearization or self._tree.raised:
             return not self._is_within(_AT_END, chi2)
         return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones."""
+        return not (self._tree.deferred or self._tree.behind)
+
+    @property
+    def _has_new(self) -> bool:
+        """Whether anything came or was edited since the last step."""
+        return self._graph.mark() != self._mark or self._tree.state.item(tl.S_EDITED) != 0
 
     @property
     def _stalls(self) -> bool:
@@ -338,14 +348,14 @@ class TreeSteps:
             *(self._left(result, budget) if budget else _NO_BUDGET),
         ))  # fmt: skip
 
-    def _left(self, result: Minimization | None, budget: float) -> tuple[int, float, float, float]:
+    def _left(self, result: Minimization | None, budget: float) -> tuple[int, float, float, float, bool]:
         """What a step with a budget has left to do, and what it took of it: the last fields of a report."""
         totals = self._tree.totals
         model, chi2, error, least = (totals.item(k) for k in (tl.T_MODEL, tl.T_CHI2, tl.T_ERROR, tl.T_LEAST))
         more = max(chi2 - model, 0.0) if self._tree.behind else 0.0
         error += totals.item(tl.T_EXCESS)
         unsolved = 0.0 if result and result.converged else min(error + more, max(chi2, 0.0) - least)
-        return self._tree.deferred, unsolved, totals.item(tl.T_WORK), budget
+        return self._tree.deferred, unsolved, totals.item(tl.T_WORK), budget, self.complete
 
 
 def _because(count: int, rounds: int, chords: int) -> str:

@@ -79,8 +79,13 @@ class IncrementalSteps:
         """For tests."""
         return self._system
 
-    def step(self, settle: bool, budget: float = 0.0) -> StepReport:
-        """As `Solver.step`."""
+    @property
+    def complete(self) -> bool:
+        """Every step does all there is to do."""
+        return True
+
+    def step(self, settle: bool, budget: float = 0.0, always: bool = False) -> StepReport:
+        """As `Solver.step`; there is no budget."""
         return self._step(settle, self._options.initialize_locally)
 
     def resume(self, settle: bool) -> StepReport:

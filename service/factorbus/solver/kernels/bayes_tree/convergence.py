@@ -128,7 +128,7 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
     chi2 = totals[tl.T_CHI2]
     totals[tl.T_ALLOWED] = converged_error(settings, state, totals)
     # What a budget has put off says nothing of how fast the others converge.
-    put_off = state[tl.S_PENDING] != 0 and state[tl.S_CONTINUES] == 0 and settings[tl.P_BUDGET] < math.inf
+    put_off = state[tl.S_PENDING] != 0 and settings[tl.P_BUDGET] < math.inf
     unconverged = left(totals) > totals[tl.T_ALLOWED]
     state[tl.S_SLOW] = 1 if unconverged and not put_off else 0
     if unconverged and put_off:

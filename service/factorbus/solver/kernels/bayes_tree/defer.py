@@ -15,7 +15,7 @@ import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
-from factorbus.solver.kernels.bayes_tree.convergence import PASSED_OVER
+from factorbus.solver.kernels.bayes_tree.convergence import FINISHED, PASSED_OVER
 from factorbus.solver.kernels.bayes_tree.linearization_error import moves_far
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.relinearize import MOVES
@@ -50,14 +50,16 @@ def choose_due(graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
     first.  All of them, if they fit.
     """
     state = tree.state
-    if not may_try(state) or state[tl.S_BEHIND] != 0:
+    if not (may_try(state) or state[tl.S_CONTINUES] != 0) or state[tl.S_BEHIND] != 0:
         return tree.pending[:0].copy()
     moving = choose_among(list_considered(graph, tree, -1.0, settings), graph, tree, f1, settings)
     if moving.size == state[tl.S_PENDING]:
         return moving
     # A step that gained much has all relinearized that has a part in a much smaller sum than what keeps the map from
     # having converged: what does not fit of that is not worth the steps that follow.
-    least = PASSED_OVER * settings[tl.P_CONVERGED] * (tree.totals[tl.T_CHI2] + LEAST_CHI2) / state[tl.S_FACTORS]
+    # What is left alone has all relinearized in time.
+    share = FINISHED if state[tl.S_CONTINUES] != 0 else settings[tl.P_CONVERGED]
+    least = PASSED_OVER * share * (tree.totals[tl.T_CHI2] + LEAST_CHI2) / state[tl.S_FACTORS]
     return choose_among(list_considered(graph, tree, least, settings), graph, tree, f1, settings)
 
 

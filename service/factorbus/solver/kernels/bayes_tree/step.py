@@ -13,7 +13,7 @@
 9  measure        χ² at the estimate, and how far factors are from their linear models
 10 correct        models and right-hand sides where that is so far that it cannot wait, with R as it is, and 8 and 9
 11 again from 2   while it is so far still
-A step with nothing new goes on from 2 with what waits, and substitutes back through the whole tree.
+A step with nothing new goes on from 2 with what waits, and without a budget substitutes back through the whole tree.
 One with a budget does of 2, 8, 10 and 11 what fits: what is left goes on in the steps that follow (`defer`).
 """
 
@@ -80,8 +80,6 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
             return status
         note_before(v1, f1, settings[tl.P_BUDGET] < math.inf, state, totals)
     scaled = scale_thresholds(f1, graph.counts[at.SCALARS], settings, state, totals)
-    if state[tl.S_CONTINUES] != 0:
-        scaled[tl.P_BUDGET] = math.inf
     bounded = scaled[tl.P_BUDGET] < math.inf
     if state[tl.S_CONTINUES] != 0 and not goes_on_with_it:
         mark_unconverged(graph, tree, scaled)
@@ -147,7 +145,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     changed = tree.changed[: state[tl.S_CHANGED]]
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
-    if put_off and is_in_vain(scaled, state, totals):
+    if put_off and state[tl.S_CONTINUES] == 0 and is_in_vain(scaled, state, totals):
         state[tl.S_TRY_AT] = state[tl.S_STEP] + RETRY
     note_after(settings, state, totals)
     return tl.DONE

@@ -12,9 +12,9 @@ LEAST_CHI2 = 1e-2
 def scale_thresholds(factors: int, scalars: int, tree_settings: F64, state: I64, totals: F64) -> F64:
     """The settings of the tree with their thresholds for a graph with this number of factors and of scalars."""
     unit, scaled = totals[tl.T_UNIT], tree_settings.copy()
-    continues = state[tl.S_CONTINUES] != 0
+    whole = state[tl.S_CONTINUES] != 0 and not tree_settings[tl.P_BUDGET] < math.inf
     per_scalar = unit * math.sqrt(factors / max(scalars, 1))  # (9.17)
-    scaled[tl.P_WILDFIRE_THRESHOLD] = 0.0 if continues else scaled[tl.P_WILDFIRE_THRESHOLD] * per_scalar
+    scaled[tl.P_WILDFIRE_THRESHOLD] = 0.0 if whole else scaled[tl.P_WILDFIRE_THRESHOLD] * per_scalar
     scaled[tl.P_RELINEARIZE_THRESHOLD] *= unit
     scaled[tl.P_MAX_ERROR] *= unit
     scaled[tl.P_COOLDOWN_FLOPS] = max(state[tl.S_RELINEARIZING] / tree_settings[tl.P_COOLDOWN_FLOPS], 1.0)

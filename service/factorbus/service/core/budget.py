@@ -1,0 +1,92 @@
+"""What a step may take: milliseconds as units of the solver's work, by what steps took.  Pure; the clock is the host's.
+
+A step is given units, which are reckoned before the work and make the same bits wherever it is done; the journal has
+them.  How many make a millisecond is measured where the service starts, and follows what steps take from then on:
+
+    rate ← rate exp(w clip(ln(units / ms / rate), ±CLIPPED))
+
+with w SLOWER where the step was slower than the rate, else FASTER.  So one step, whatever it met, hardly moves it, and
+it comes to rest where most steps take less than was asked.
+Reasons: docs/decisions/budget.md.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from factorbus.service.core.events import BudgetUse, Stepped
+
+USUAL_UNITS_PER_MS = 1e8  # where nothing was measured
+SLOWER, FASTER, CLIPPED = 0.06, 0.02, 0.5
+FAR = 8.0  # times what was measured at the start, either way: beyond it nothing is believed
+LEAST_SHARE = 0.1  # of its budget that a step has to use: of shorter ones much is not counted in units
+MOST_DOUBLED = 6  # times, in further steps of no use; after that they have no bound
+_NONE = BudgetUse()
+
+
+class StepBudget:
+    """The budget of one map's steps; budget_ms 0: they have no bound.  units_per_ms: as measured at the start."""
+
+    def __init__(self, budget_ms: float = 0.0, units_per_ms: float = USUAL_UNITS_PER_MS) -> None:
+        self.budget_ms, self.units_per_ms = budget_ms, units_per_ms
+        self._began = units_per_ms
+        self._use, self._step_ms = _NONE, 0.0
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last step left nothing for later ones."""
+        return self._use.complete
+
+    def units(self, doubled: int = 0) -> float:
+        """What a step that begins now may take, a whole number of units, or that doubled so often; 0: it has no bound.
+
+        doubled: of a further step, how many before it were of no use.
+        """
+        if doubled > MOST_DOUBLED or (doubled and self.complete):
+            return 0.0
+        return float(round(self.budget_ms * self.units_per_ms)) * 2.0**doubled
+
+    def restore(self, use: BudgetUse) -> None:
+        """The map was here before, and this is known of its last step."""
+        self._use = use
+
+    def stepped(self, stepped: Stepped) -> None:
+        """A step was made."""
+        if not self.budget_ms:
+            return
+        self._use, self._step_ms = stepped.use or _NONE, stepped.step_ms
+        if stepped.use is not None and stepped.strategy != "batch":  # what replaces a step is not counted in units
+            self._follow(stepped.use, stepped.step_ms)
+
+    def _follow(self, use: BudgetUse, step_ms: float) -> None:
+        if not step_ms > 0.0 or not use.work >= LEAST_SHARE * use.budget or not use.work > 0.0:
+            return
+        gap = math.log(use.work / step_ms / self.units_per_ms)
+        gap = min(max(gap, -CLIPPED), CLIPPED)
+        rate = self.units_per_ms * math.exp((FASTER if gap > 0.0 else SLOWER) * gap)
+        self.units_per_ms = min(max(rate, self._began / FAR), self._began * FAR)
+
+    def row(self) -> dict[str, Any]:
+        """What the row of a map says of it: nothing where there is none."""
+        return {"budget_ms": self.budget_ms, "complete": self.complete} if self.budget_ms else {}
+
+    def stats(self) -> dict[str, Any]:
+        """What else the statistics of a map say."""
+        if not self.budget_ms:
+            return {}
+        told = {
+            "budget_ms": self.budget_ms,
+            "step_ms": self._step_ms,
+            "deferred_relinearizations": self._use.deferred_relinearizations,
+            "unsolved": self._use.unsolved if self._use.unsolved < math.inf else None,
+            "complete": self.complete,
+            "units_per_ms": self.units_per_ms,
+        }
+        return {"budget": told}
+
+
+def use_of(reported: Mapping[str, Any]) -> BudgetUse | None:
+    """What a step made of its budget, by its report; None: it had none."""
+    if "budget" not in reported:
+        return None
+    return BudgetUse(*(reported[name] for name in BudgetUse._fields))

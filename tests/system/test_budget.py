@@ -1,0 +1,194 @@
+"""Maps whose steps have a budget, in real processes: killed with work deferred, forked, followed, asked, settled.
+
+FACTORBUS_KILLS says how often a service is killed; here fewer, to save time.
+"""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from journalled import Services, Stream, rows
+from processes import PATIENCE_S
+from replicas import MAP, Link, check_equal, replica_settings, wait_until_level
+
+from factorbus.client import Map, Refused, connect
+from factorbus.journal.store import open_store
+from factorbus.proto.messages import Batch
+from factorbus.service.config import Limits
+from factorbus.service.journal.library import make_map_solver
+from factorbus.service.journal.recovery import verify
+from factorbus.service.questions.answers import Question
+from factorbus.simulate import manhattan
+from factorbus.solver import Solver
+
+KILLS = int(os.environ.get("FACTORBUS_KILLS", "6"))
+POSES = 700
+TIGHT_MS = 0.05  # so that a map of hundreds of poses has what one of tens of thousands has with 10 ms
+
+
+def driven_batches(poses: int = POSES, seed: int = 3) -> list[Batch]:
+    return [step.batch for step in manhattan(poses, seed)]
+
+
+def optimum(batches: list[Batch]) -> float:
+    solver = Solver()
+    for batch in batches:
+        solver.stage(batch)
+        solver.step()
+    return solver.step(settle=True).chi2
+
+
+def wait_finished(services: Services, joined: Map) -> dict[str, Any]:
+    """Until nothing is left, and no further step is of use."""
+    return services.eventually(joined.stats, lambda seen: seen["complete"] and not seen["converging"])
+
+
+def replayed(folder: Path) -> tuple[dict[int, tuple[bytes, int]], list[float]]:
+    """The values that a journal leads to, every record of which has the same bits again; the budgets of its records."""
+    store = open_store(folder, read_only=True)
+    try:
+        header = store.header()
+        map_solver = make_map_solver(header.mode, header.options, header.epoch, Limits())
+        assert all(same for _, same in verify(store, map_solver))
+        return rows(map_solver.snapshot([Question("estimate")]).variables), [r.budget for r in store.records()]
+    finally:
+        store.close()
+
+
+@pytest.mark.timeout(1800)
+def test_killed_with_work_deferred_it_is_the_same_map_and_goes_on(
+    services: Callable[..., Services], tmp_path: Path
+) -> None:
+    chance, batches = random.Random(5), driven_batches()
+    running = services(tmp_path / "j", "checkpoint_s=0.1", f"budget_ms={TIGHT_MS}")
+    deferred = 0
+    with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("m", window=8) as driven:
+        assert bus.maps()[0].budget_ms == TIGHT_MS
+        stream = Stream(driven, batches)
+        stream.start()
+        for kill in range(KILLS):
+            stream.allow((POSES - 100) * (kill + 1) // KILLS - (POSES - 100) * kill // KILLS)
+            if kill % 2:  # all is answered, and further steps go on
+                stream.wait_for((POSES - 100) * (kill + 1) // KILLS)
+            time.sleep(chance.uniform(0.0, 0.6))  # the moments are what this is about
+            deferred += not driven.stats()["complete"]
+            answered = set(stream.acknowledged)
+            running.end(signal.SIGKILL)
+            running.start()
+            there = {int(key) for group in driven.ask_estimate().variables for key in group.keys}
+            assert {int(k) for n in answered for g in batches[n - 1].variables for k in g.keys} <= there
+        stream.allow(POSES)
+        stream.wait_for(POSES)
+        assert not stream.fault
+        stats = wait_finished(running, driven)
+        estimate = driven.ask_estimate()
+    running.end(signal.SIGTERM)
+    values, budgets = replayed(tmp_path / "j" / "m")
+    assert rows(estimate.variables) == values
+    assert sum(budget > 0.0 for budget in budgets) > 0.9 * len(budgets)
+    assert deferred, "no kill came while anything was deferred"
+    assert stats["chi2"] <= optimum(batches) * (1.0 + 1e-6)
+    ran = subprocess.run(
+        [sys.executable, "-m", "factorbus.cli", "journal", "verify", "m", "--journal", str(tmp_path / "j")],
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_what_is_told_and_settled(services: Callable[..., Services], tmp_path: Path) -> None:
+    batches = driven_batches(400)
+    running = services(tmp_path / "j")
+    with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus:
+        row = bus.create("tight", budget_ms=TIGHT_MS)
+        assert (row.budget_ms, row.complete, bus.create("free").budget_ms) == (TIGHT_MS, True, 0.0)
+        assert bus.create("tight").budget_ms == TIGHT_MS, "whichever it has"
+        with pytest.raises(Refused, match="budget") as refused:
+            bus.create("tight", budget_ms=3.0)
+        assert refused.value.code == "other_budget"
+        for wrong in (-1.0, 1e6, float("nan")):
+            with pytest.raises(Refused) as refused:
+                bus.create("wrong", budget_ms=wrong)
+            assert refused.value.code == "bad_option"
+        with pytest.raises(Refused) as refused:
+            bus.create("wrong", "inc-l", budget_ms=5.0)
+        assert refused.value.code == "no_budget"
+        with bus.map("tight") as driven:
+            reports = [driven.insert(batch).report for batch in batches]
+            left = [report for report in reports if not report["complete"]]
+            assert left
+            assert all({"deferred_relinearizations", "unsolved", "step_ms"} <= set(report) for report in left)
+            assert {report["budget_ms"] for report in reports} == {TIGHT_MS}
+            told = driven.stats()["budget"]
+            assert told["budget_ms"] == TIGHT_MS
+            assert told["units_per_ms"] > 0.0
+            settled = driven.settle()
+            assert settled.report["converged"]
+            assert "complete" not in settled.report, "it had no budget"
+            assert settled.report["complete"], "so nothing is left"
+            assert settled.report["chi2"] <= optimum(batches) * (1.0 + 1e-6)
+            assert driven.stats()["complete"]
+        with bus.map("free") as driven:
+            report = driven.insert(batches[0]).report
+            assert not {"budget", "budget_ms", "deferred_relinearizations"} & set(report)
+            assert "budget" not in driven.stats()
+
+
+def test_a_fork_in_the_middle_goes_on_with_the_same_budget(services: Callable[..., Services], tmp_path: Path) -> None:
+    batches = driven_batches(500)
+    running = services(tmp_path / "j", f"budget_ms={TIGHT_MS}")
+    with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("m") as driven:
+        for batch in batches[:450]:
+            driven.send(batch)
+        driven.flush(PATIENCE_S)
+        row = bus.fork("m", "what-if")
+        assert row.budget_ms == TIGHT_MS
+        with bus.map("what-if", create=False) as fork:
+            for batch in batches[450:]:
+                fork.insert(batch)
+                driven.insert(batch)
+            ends = [wait_finished(running, each)["chi2"] for each in (driven, fork)]
+            estimates = [rows(each.ask_estimate().variables) for each in (driven, fork)]
+    running.end(signal.SIGTERM)
+    assert ends == pytest.approx([optimum(batches)] * 2, rel=1e-6)
+    for name, estimate in zip(("m", "what-if"), estimates, strict=True):
+        values, budgets = replayed(tmp_path / "j" / name)
+        assert values == estimate
+        assert any(budgets)
+
+
+def test_a_replica_makes_the_same_steps(services: Callable[..., Services], tmp_path: Path) -> None:
+    """Each end has a budget of its own; whoever makes a record first says what its steps had."""
+    batches = driven_batches(400)
+    base = services(tmp_path / "base", 'name="base"')
+    base_endpoint = base.start()
+    link = Link(base_endpoint)
+    robot = services(tmp_path / "robot", *replica_settings(link), f"budget_ms={TIGHT_MS}")
+    with (
+        connect(robot.start(), client="robot", timeout_s=PATIENCE_S) as bus,
+        connect(base_endpoint, client="tablet", timeout_s=PATIENCE_S) as other,
+    ):
+        driven = bus.map(MAP)
+        for n, batch in enumerate(batches):
+            driven.send(batch)
+            if n == 200:
+                driven.flush(PATIENCE_S)
+                link.cut(0.3, noticed=True)
+        driven.flush(PATIENCE_S)
+        at_base = other.map(MAP)
+        wait_until_level(driven, at_base, len(batches))
+        assert (driven.stats()["budget_ms"], at_base.stats().get("budget_ms")) == (TIGHT_MS, None)
+        assert rows(driven.ask_estimate().variables) == rows(at_base.ask_estimate().variables)
+    robot.end(signal.SIGTERM)
+    base.end(signal.SIGTERM)
+    link.relay.close()
+    check_equal(tmp_path / "base", tmp_path / "robot", len(batches))
+    values = [replayed(tmp_path / end / MAP) for end in ("base", "robot")]
+    assert values[0] == values[1]
+    assert sum(budget > 0.0 for budget in values[0][1]) > 20
