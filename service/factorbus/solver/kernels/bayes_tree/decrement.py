@@ -5,8 +5,8 @@ add up along directions that the map hardly holds, and the step takes off more t
 far below what is allowed, the forces are added up by variable first:
 
 1  gradient    of the factors with a part in Σ error²: at the estimate, less that of their linear models
-2  forward     d = R⁻ᵀ g in the cliques of their variables and those above, children first: |d|² is the decrement
-3  back        p = R⁻¹ d where that is too much, parents first: R may be old, and what χ² loses along p is less then
+2  forwards    d = R⁻ᵀ g in the cliques of their variables and those above, children first: |d|² is the decrement
+3  backwards   p = R⁻¹ d where that is too much, parents first: R may be old, and what χ² loses along p is less then
 """
 
 import numpy as np
@@ -51,11 +51,11 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
         work += work_of_solving(clique[cliques[k]])
     note_work(SCANNING * state[tl.S_FACTORS] + RELINEARIZING * taken + work, tree.totals)
     # 2
-    square = forward(graph, tree, cliques, g)
+    square = solve_forwards(graph, tree, cliques, g)
     if square <= most:
         return square
     # 3
-    back(graph, tree, cliques, g)
+    solve_backwards(graph, tree, cliques, g)
     more, curvature = np.zeros(g.size), square
     for f in range(state[tl.S_FACTORS]):
         if tree.factor_errors[f, tl.E_ERROR] > least and not is_member(f, fac):
@@ -151,7 +151,7 @@ def subtract_model(graph: Graph, tree: Tree, row: int, x: F64, gradient: bool, o
 
 
 @part
-def forward(graph: Graph, tree: Tree, cliques: I64, g: F64) -> float:
+def solve_forwards(graph: Graph, tree: Tree, cliques: I64, g: F64) -> float:
     """d = R⁻ᵀ g over `cliques`, children first, in the place of g; gives |d|²."""
     clique, numbers, square = tree.clique, tree.numbers, 0.0
     eta = np.empty(widest_of(cliques, clique))
@@ -171,7 +171,7 @@ def forward(graph: Graph, tree: Tree, cliques: I64, g: F64) -> float:
 
 
 @part
-def back(graph: Graph, tree: Tree, cliques: I64, d: F64) -> None:
+def solve_backwards(graph: Graph, tree: Tree, cliques: I64, d: F64) -> None:
     """p = R⁻¹ d over `cliques`, which come children first, in the place of d."""
     clique, numbers = tree.clique, tree.numbers
     x = np.empty(widest_of(cliques, clique))
