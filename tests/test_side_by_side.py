@@ -52,4 +52,4 @@ def test_no_test_listens_at_a_port_of_its_choice() -> None:
         for number, line in enumerate(path.read_text().splitlines(), 1)
         if fixed.search(line)
     ]
-    assert found == ["tests/ros2/test_ros2_readme.py:48"], "which compares, and starts at others"
+    assert found == ["tests/ros2/test_ros2_readme.py:51"], "which compares, and starts at others"

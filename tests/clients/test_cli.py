@@ -84,7 +84,7 @@ def test_version_names_the_libraries() -> None:
         (["replay", "broken.g2o", "--in-process"], BAD_FILE, "broken.g2o:2: "),
         (["replay", "one.g2o", "--connect", "tcp/127.0.0.1:9", "--timeout", "0.1"], UNAVAILABLE, "[unavailable]"),
         (["replay", "one.g2o", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
-        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o, .pyfg, .jrl, .tum or .kitti"),
+        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o, .pyfg, .jrl, .cbor, .tum or .kitti"),
         (["convert", "broken.g2o", "one.tum"], BAD_FILE, "broken.g2o:2: "),
         (["simulate", "manhattan"], USAGE, "there is nothing to write"),
         (["simulate", "atlantis", "--out", "a.g2o"], USAGE, "atlantis"),

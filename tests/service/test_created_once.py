@@ -7,6 +7,7 @@ import pytest
 
 from factorbus.proto.problems import UnknownMap
 from factorbus.service.maps.serial_executor import SerialExecutor
+from factorbus.service.questions.admin import MadeAs
 from factorbus.service.registry import Maps
 
 
@@ -17,7 +18,7 @@ class Made(Maps):
         self._control, self._unopened = control, {"damaged": UnknownMap("damaged")}
         self.made: list[tuple[str, str]] = []
 
-    def create(self, name: str, mode: str | None) -> dict[str, Any]:
+    def create(self, name: str, asked: MadeAs = MadeAs()) -> dict[str, Any]:  # noqa: B008
         self.made.append((name, threading.current_thread().name))
         if name == "bad":
             raise UnknownMap(name)
@@ -31,7 +32,7 @@ def test_one_after_the_other_with_what_clients_ask_for() -> None:
     def asked() -> None:
         begun.set()
         assert goes_on.wait(60)
-        maps.create("hall", None)
+        maps.create("hall")
 
     control.hand(asked)
     assert begun.wait(60)

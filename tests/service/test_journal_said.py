@@ -10,10 +10,11 @@ import pytest
 
 from factorbus.cli.main import main
 from factorbus.journal.bundle import export_map, import_map
+from factorbus.journal.connecting import FORM_WITH_BUDGETS
 from factorbus.journal.digest import sealed
 from factorbus.journal.problems import JournalFailed, NoJournal
 from factorbus.journal.records import ACCEPTED, Entry, JournalRecord
-from factorbus.journal.store import FORM, NAME, Store, create, open_store
+from factorbus.journal.store import NAME, Store, create, open_store
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Config
 from factorbus.service.journal.library import open_library
@@ -37,7 +38,7 @@ def test_a_file_that_is_no_exported_map_is_named_with_what_is_wanted(store: Stor
     database.close()
     (tmp_path / "newer").write_bytes((tmp_path / "m.fbmap").read_bytes())
     with sqlite3.connect(tmp_path / "newer") as database:
-        database.execute(f"PRAGMA user_version = {FORM + 1}")
+        database.execute(f"PRAGMA user_version = {FORM_WITH_BUDGETS + 1}")
     database.close()
     for file, code, words in (
         ("broken", "bad_file", "is damaged: "),

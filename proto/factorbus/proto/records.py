@@ -7,7 +7,6 @@ A place in a journal is the number of a record and the chain (16 bytes) that its
 Every reader raises BadMessage, TooLarge.
 """
 
-import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -27,6 +26,7 @@ START_CHAIN = bytes(16)  # before the first record
 MOST_RECORDS, MOST_NAMED = 256, 4096  # in one message; inserts that an asker may name
 MOST_BYTES = 256 << 10  # of the messages in an answer, unless the asker wants fewer
 _FURTHER, _REBUILT = 1, 2
+_MOST_UNITS = 2**62  # of work, which a budget is counted in
 _OUTCOMES = (0, 1, 2)  # accepted, refused by the solver, refused before
 
 
@@ -168,7 +168,7 @@ def _place(where: str, content: fields.Map) -> JournalPlace:
 def _row(record: SentRecord) -> list[Any]:
     flags = _FURTHER * record.further + _REBUILT * record.rebuilt
     row = [record.revision, flags, [_columns(insert) for insert in record.inserts]]
-    return [*row, record.budget] if record.budget else row
+    return [*row, round(record.budget)] if record.budget else row
 
 
 def _columns(insert: SentInsert) -> list[Any]:
@@ -222,10 +222,12 @@ def _budget(where: str, columns: list[Any]) -> float:
     match columns:
         case []:
             return 0.0
-        case [float(budget)] if 0.0 < budget < math.inf:
-            return budget
+        case [int(budget)] if 0 < budget < _MOST_UNITS and budget is not True:
+            return float(budget)
     raise BadMessage(
-        f"{where}[3]", "is something else", "what each step might take, a number above 0, and nothing more"
+        f"{where}[3]",
+        "is something else",
+        "the units of work that each step might take, an integer from 1 to 2⁶², and nothing more",
     )
 
 

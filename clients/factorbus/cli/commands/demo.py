@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from factorbus.cli.process.options import WORLDS, json_option, out_option
 from factorbus.wording import counted
 
 _COMPARISONS = 10
+_LAST_DELTAS_S = 10.0  # they come after the robot has its last answer, if at all
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +172,11 @@ def _look_on(request: DemoRequest, solver: Any, robot: Any, viewer: Any) -> None
             if revision // every > asked and revision < request.poses:
                 asked = revision // every
                 viewer.compare()
-        show(viewer.wait_for_delta(timeout_s=0.2), _word(viewer))
+        # The last deltas may come after the robot has its answers.
+        end = time.monotonic() + _LAST_DELTAS_S
+        while (revision := viewer.wait_for_delta(timeout_s=0.2)) < request.poses and time.monotonic() < end:
+            show(revision, _word(viewer))
+        show(revision, _word(viewer))
 
 
 def _word(viewer: Any) -> str:
