@@ -55,7 +55,7 @@ KERNEL_TESTS := tests/solver/test_factor_kinds.py tests/solver/test_cholesky_ker
 # A kernel that counts from the end of an array without saying so would read what is before it.
 CHECKED_TESTS := tests/solver/test_solver_steps.py tests/solver/test_tree.py tests/solver/test_covariance.py \
 	tests/solver/test_joined.py tests/solver/test_worker_threads.py tests/solver/test_columns.py tests/solver/test_renew.py \
-	tests/solver/test_room.py
+	tests/solver/test_room.py tests/solver/test_decrement.py
 # Numba as it is, without what we change in it.
 STOCK_TESTS := tests/solver/test_jit.py tests/solver/test_jit_arrays.py tests/solver/test_cholesky_kernels.py tests/solver/test_factor_kinds.py
 # Three ways, side by side: each has kernels of its own to compile, on one core.
