@@ -133,7 +133,7 @@ class Driver(threading.Thread):
     def _drive(self, driven: Map) -> None:
         due = time.perf_counter() + self._period_s * np.random.default_rng(self._number).uniform()
         for batch in self._steps:
-            time.sleep(max(due - time.perf_counter(), 0.0))
+            time.sleep(max(due - time.perf_counter(), 0.0))  # the pace of the drive
             began = time.perf_counter()
             accepted = driven.insert(together([batch], self._first, self._number * MINE))
             self.sent.append((began, accepted.revision))

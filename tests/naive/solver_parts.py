@@ -78,3 +78,13 @@ def joined_by(solver: Solver) -> list[list[int]]:
     fac = graph.fac[: graph.counts[at.FACTORS]]
     ends = [graph.ends_of(row) for row in np.flatnonzero(fac[:, at.F_KIND] == at.LINEAR).tolist()]
     return [graph.keys[of].tolist() for of in ends if len(of) > 2]
+
+
+# Nothing is relinearized, so linearization errors are large.
+NEVER_RELINEARIZES: dict[str, float] = {
+    "relinearize_next_step_share": 1e9,
+    "relinearize_same_step_share": 1e9,
+    "relinearize_max_error": 1e9,
+    "relinearize_max_wait": 10**9,
+    "converged_share": 1e9,
+}

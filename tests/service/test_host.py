@@ -243,7 +243,7 @@ def said(setup: Setup) -> list[Effect]:
 
 
 def content(effect: Effect) -> bytes | str:
-    """What an answer says, whoever asked."""
+    """What an answer says, no matter who asked."""
     return effect.problem.code if isinstance(effect, Refuse) else cast(Answer, effect).message
 
 

@@ -7,7 +7,7 @@ import pytest
 from bench.every import hard
 from bench.every.motion import PLANE, SPACE
 from naive.random_mounts import mount_steps
-from naive.solver_parts import graph_in
+from naive.solver_parts import NEVER_RELINEARIZES, graph_in
 from naive.tree_records import tree_of
 
 from factorbus.proto.messages import Batch
@@ -24,14 +24,7 @@ from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 
 # Nothing is relinearized, and nothing left undone: so linearization errors are large, and all that the gradient has.
-NEVER = Options.of(
-    relinearize_next_step_share=1e9,
-    relinearize_same_step_share=1e9,
-    relinearize_max_error=1e9,
-    relinearize_max_wait=10**9,
-    converged_share=1e9,
-    wildfire_threshold=0.0,
-)
+NEVER = Options.of(**NEVER_RELINEARIZES, wildfire_threshold=0.0)
 
 
 def drive_of(name: str) -> Iterator[Batch]:

@@ -11,7 +11,7 @@ from naive.random_graphs import camera_steps
 from naive.random_imu import imu_steps
 from naive.random_mounts import mount_steps
 from naive.random_others import other_steps
-from naive.solver_parts import graph_in, row_count
+from naive.solver_parts import NEVER_RELINEARIZES, graph_in, row_count
 from naive.tree_records import tree_of
 
 from factorbus.solver import Options, Solver
@@ -24,13 +24,7 @@ from factorbus.solver.kernels.model.candidates import evaluate_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.records import graph_at
 
-FAR = Options.of(
-    relinearize_next_step_share=1e9,
-    relinearize_same_step_share=1e9,
-    relinearize_max_error=1e9,
-    relinearize_max_wait=10**9,
-    converged_share=1e9,
-)
+FAR = Options.of(**NEVER_RELINEARIZES)
 
 
 WORLDS = {

@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from naive.solver_parts import graph_in
+from naive.solver_parts import NEVER_RELINEARIZES, graph_in
 from naive.tree_records import tree_of
 
 from factorbus.simulate import WORLDS
@@ -17,14 +17,7 @@ from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import graph_at
 
-# Nothing is relinearized, so linearization errors are large.
-NEVER = Options.of(
-    relinearize_next_step_share=1e9,
-    relinearize_same_step_share=1e9,
-    relinearize_max_error=1e9,
-    relinearize_max_wait=10**9,
-    converged_share=1e9,
-)
+NEVER = Options.of(**NEVER_RELINEARIZES)
 
 
 @pytest.mark.parametrize(("world", "poses"), [("manhattan", 300), ("city_trees", 120), ("sphere", 150)])

@@ -6,7 +6,7 @@ Residuals and Jacobians are the kernels' own, which other tests hold against dif
 import numpy as np
 import pytest
 from naive.dense_least_squares import full
-from naive.solver_parts import graph_in
+from naive.solver_parts import NEVER_RELINEARIZES, graph_in
 from naive.tree_records import tree_of
 
 from factorbus.simulate import WORLDS
@@ -19,14 +19,7 @@ from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.retract import move
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
-# Nothing is relinearized, so linearization errors are large.
-NEVER = Options.of(
-    relinearize_next_step_share=1e9,
-    relinearize_same_step_share=1e9,
-    relinearize_max_error=1e9,
-    relinearize_max_wait=10**9,
-    converged_share=1e9,
-)
+NEVER = Options.of(**NEVER_RELINEARIZES)
 
 
 @pytest.mark.parametrize("world", ["manhattan", "sphere"])

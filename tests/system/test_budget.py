@@ -164,7 +164,7 @@ def test_a_fork_in_the_middle_goes_on_with_the_same_budget(services: Callable[..
 
 
 def test_a_replica_makes_the_same_steps(services: Callable[..., Services], tmp_path: Path) -> None:
-    """Each end has a budget of its own; whoever makes a record first says what its steps had."""
+    """Each end has a budget of its own; the end that makes a record first says what its steps had."""
     batches = driven_batches(400)
     base = services(tmp_path / "base", 'name="base"')
     base_endpoint = base.start()

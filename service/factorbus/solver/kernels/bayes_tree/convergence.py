@@ -19,8 +19,8 @@ LARGE_GAIN = 0.05  # of χ², in one round or all,
 AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
 MOST_LEFT = 0.5  # of the Σ error² that is allowed: what a chord step may leave, as it counts as a round
 SLOW = 0.1  # times as much error² is allowed after a step that had not converged
-UNCHECKED = 0.2  # of the Σ error² that is allowed: with more, and as much changed, the decrement is computed,
-ABSOLUTE = 0.02  # where factors of one variable have more than this share of it
+UNCHECKED = 0.2  # of `converged_share` χ²: with more Σ error², and as much changed, the decrement is computed,
+ABSOLUTE = 0.02  # of the same, where factors of one variable have more error² than that
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -51,7 +51,7 @@ def left(totals: F64) -> float:
 @part
 def check_decrement(graph: Graph, tree: Tree, settings: F64) -> None:
     """Compute the decrement where Σ error² is as small as is allowed, but not by far, has changed by as much, and
-    factors that say where in the world a variable is have a part in it.
+    factors of one variable have a part in it.
     """
     state, totals = tree.state, tree.totals
     error, share = totals[tl.T_ERROR], settings[tl.P_CONVERGED] * (totals[tl.T_CHI2] + LEAST_CHI2)
