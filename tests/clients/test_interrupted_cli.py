@@ -10,7 +10,8 @@ from contextlib import contextmanager
 import pytest
 
 from factorbus.cli.output.exits import INTERRUPTED
-from factorbus.cli.process.stopping import interrupt_on_sigterm, signalled
+from factorbus.cli.process.stopping import interrupt_on_sigterm
+from factorbus.stopping import signalled
 
 # What the signals raise is lost.
 DEAF = """

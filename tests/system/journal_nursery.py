@@ -10,12 +10,12 @@ import logging
 import os
 import signal
 import sys
-import threading
 
 from factorbus import idp, solver
 from factorbus.proto.problems import Problem
 from factorbus.service.app import serve
 from factorbus.service.config import Config, checked_config
+from factorbus.stopping import stop_on_signals
 
 
 def main() -> None:
@@ -39,11 +39,10 @@ def main() -> None:
 
 def run(config: Config) -> None:
     """Serve until SIGTERM; never returns."""
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
     code = 0
     try:
-        serve(config, lambda endpoints: say("ready", *endpoints), stop)
+        with stop_on_signals() as stop:
+            serve(config, lambda endpoints: say("ready", *endpoints), stop)
     except Problem as problem:
         say("cannot", problem.code)
         logging.error("%s", problem)

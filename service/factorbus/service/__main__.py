@@ -2,9 +2,7 @@
 
 import argparse
 import logging
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,22 +11,21 @@ from factorbus.ownership import UnsafeFolder
 from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.problems import Problem
 from factorbus.service.config import DURABILITIES, Config, checked_config, load_config
+from factorbus.stopping import stop_on_signals
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until SIGTERM or SIGINT.  Prints `ready ENDPOINT ...` when clients can connect; 2: cannot start."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    from factorbus.service.app import serve
+    with stop_on_signals() as stop:
+        from factorbus.service.app import serve
 
-    try:
-        serve(_config(options), lambda endpoints: print("ready", *endpoints, flush=True), stop)
-    except (Problem, UnsafeFolder, OSError) as problem:
-        print(f"factorbus: {problem}", file=sys.stderr)
-        return 2
+        try:
+            serve(_config(options), lambda endpoints: print("ready", *endpoints, flush=True), stop)
+        except (Problem, UnsafeFolder, OSError) as problem:
+            print(f"factorbus: {problem}", file=sys.stderr)
+            return 2
     return 0
 
 

@@ -2,13 +2,12 @@
 
 import argparse
 import logging
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 
 from factorbus.ownership import UnsafeFolder
 from factorbus.proto.problems import Problem
+from factorbus.stopping import stop_on_signals
 from factorbus.workers.config import WorkerConfig, checked_worker_config
 
 
@@ -16,16 +15,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Work until SIGTERM or SIGINT.  Prints `ready NAME` when jobs are taken; 2: cannot start."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    from factorbus.workers.app import work
+    with stop_on_signals() as stop:
+        from factorbus.workers.app import work
 
-    try:
-        work(_config(options), lambda name: print("ready", name, flush=True), stop)
-    except (Problem, UnsafeFolder, OSError) as problem:
-        print(f"factorbus: {problem}", file=sys.stderr)
-        return 2
+        try:
+            work(_config(options), lambda name: print("ready", name, flush=True), stop)
+        except (Problem, UnsafeFolder, OSError) as problem:
+            print(f"factorbus: {problem}", file=sys.stderr)
+            return 2
     return 0
 
 

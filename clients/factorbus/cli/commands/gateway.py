@@ -70,18 +70,18 @@ def command(insecure: bool, until_eof: bool, **asked: Any) -> None:
     request = GatewayRequest(**asked)
     refuse_open_page(request.host, insecure)
     from factorbus.cli.process.bus import open_bus
-    from factorbus.cli.process.stopping import stop_on_signals, wait_until
+    from factorbus.cli.process.stopping import stop_when_asked
     from factorbus.gateway import make_app
     from factorbus.gateway.server import serving
     from factorbus.proto.ports import listening_problem
 
     people = _people(request)
     host, hosts = request.host, ("127.0.0.1", "localhost", request.host, *request.names)
-    with stop_on_signals(until_eof) as stop, open_bus(request.endpoint, request.client, request.zenoh) as bus:
+    with stop_when_asked(until_eof) as stop, open_bus(request.endpoint, request.client, request.zenoh) as bus:
         try:
             with serving(make_app(bus, hosts, people), host, request.port) as bound:
                 click.echo(f"{READY}http://{'127.0.0.1' if host == '0.0.0.0' else host}:{bound}")
-                wait_until(stop)
+                stop.wait()
         except OSError as error:
             raise listening_problem(f"{host}:{request.port}", error) from error
 

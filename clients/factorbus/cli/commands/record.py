@@ -57,13 +57,13 @@ def command(
     from factorbus.cli.output.console import print_note
     from factorbus.cli.output.exits import Stopped
     from factorbus.cli.process.bus import joined_when_there, open_bus
-    from factorbus.cli.process.stopping import stop_on_signals
+    from factorbus.cli.process.stopping import stop_when_asked
 
     path = out or Path(f"{map_name}.mcap")
     if path.exists():
         raise Stopped("file_exists", f"{path} is there already: give another --out, or remove it", path=str(path))
     with (
-        stop_on_signals(until_eof) as stop,
+        stop_when_asked(until_eof) as stop,
         open_bus(endpoint, "recorder", zenoh) as bus,
         joined_when_there(bus, map_name, stop.wait) as joined,
     ):

@@ -316,11 +316,11 @@ def _paced(steps: Any, pace_hz: float | None, rate: float | None) -> Iterator[An
 def _stay() -> None:
     """Until Ctrl-C or SIGTERM."""
     from factorbus.cli.output.console import print_note
-    from factorbus.cli.process.stopping import stop_on_signals, wait_until
+    from factorbus.cli.process.stopping import stop_when_asked
 
-    with stop_on_signals(until_eof=False) as stop:
+    with stop_when_asked(until_eof=False) as stop:
         print_note("the page stays until Ctrl-C")
-        wait_until(stop)
+        stop.wait()
 
 
 def _write(request: ReplayRequest, target: Any, source: Any, steps: Any) -> list[Path]:

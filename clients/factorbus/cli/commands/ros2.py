@@ -97,7 +97,7 @@ def command(
     """
     require("ros2", "factorbus ros2")
     from factorbus.cli.process.bus import open_bus
-    from factorbus.cli.process.stopping import stop_on_signals
+    from factorbus.cli.process.stopping import stop_when_asked
     from factorbus.ros2.bridge import Bridge
     from factorbus.ros2.messages import Messages
     from factorbus.ros2.node import open_node
@@ -108,7 +108,7 @@ def command(
     settings, ros = bridge_settings(given), as_node.ros
     with (
         _switching_often(),
-        stop_on_signals(until_eof) as stop,
+        stop_when_asked(until_eof) as stop,
         open_bus(endpoint, "ros2", zenoh) as bus,
         bus.map(map_name) as joined,
         open_node(

@@ -99,7 +99,7 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
       waiting = 1024
     """
     require("service", "factorbus serve")
-    from factorbus.cli.process.stopping import stop_on_signals
+    from factorbus.cli.process.stopping import stop_when_asked
     from factorbus.service.app import serve
 
     begin_logging(log_form, quiet)
@@ -109,7 +109,7 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
         click.echo(READY + " ".join(endpoints))
         manager.ready(f"listening on {' '.join(endpoints)}")
 
-    with stop_on_signals(until_eof, manager.stopping) as stop:
+    with stop_when_asked(until_eof, manager.stopping) as stop:
         serve(_settings(config, given), on_ready, stop, lambda health: manager.alive(health.stuck()))
 
 

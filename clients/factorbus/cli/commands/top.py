@@ -43,7 +43,7 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
     from factorbus.cli.output import console as screen
     from factorbus.cli.output.stats_table import Indicators
     from factorbus.cli.process.bus import open_bus
-    from factorbus.cli.process.stopping import stop_on_signals
+    from factorbus.cli.process.stopping import stop_when_asked
 
     console = _console()
     if not (once or as_json or _can_redraw(console)):
@@ -51,7 +51,7 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
             "top draws its tables over each other, for which standard output has to be a terminal; "
             "take --once for one look, or --json for a program"
         )
-    with stop_on_signals(until_eof) as stop, open_bus(endpoint, "top", zenoh) as bus:
+    with stop_when_asked(until_eof) as stop, open_bus(endpoint, "top", zenoh) as bus:
         indicators = Indicators(bus)
         seen = indicators.read()
         if once or as_json:

@@ -94,13 +94,13 @@ def command(
     require("watch", "factorbus watch")
     from factorbus.cli.output.console import print_note
     from factorbus.cli.process.bus import joined_when_there, open_bus
-    from factorbus.cli.process.stopping import stop_on_signals
+    from factorbus.cli.process.stopping import stop_when_asked
     from factorbus.viz.live import LiveView
     from factorbus.viz.map_follower import MapFollower
 
     interest, until = part.interest(), end.until
     with (
-        stop_on_signals(end.until_eof) as stop,
+        stop_when_asked(end.until_eof) as stop,
         open_bus(endpoint, "watcher", zenoh) as bus,
         joined_when_there(bus, map_name, stop.wait, interest) as joined,
     ):

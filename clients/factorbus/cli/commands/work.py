@@ -34,7 +34,7 @@ def command(until_eof: bool, quiet: bool, log_form: str, connect: tuple[str, ...
     factorbus work --connect tcp/solver.local:7447 --slots 4
     """
     require("service", "factorbus work")
-    from factorbus.cli.process.stopping import stop_on_signals
+    from factorbus.cli.process.stopping import stop_when_asked
     from factorbus.workers.app import work
     from factorbus.workers.config import WorkerConfig
 
@@ -46,5 +46,5 @@ def command(until_eof: bool, quiet: bool, log_form: str, connect: tuple[str, ...
         manager.ready(f"worker {name} takes jobs")
 
     config = WorkerConfig(connect=connect or (DEFAULT_ENDPOINT,), **given)
-    with stop_on_signals(until_eof, manager.stopping) as stop:
+    with stop_when_asked(until_eof, manager.stopping) as stop:
         work(config, on_ready, stop)

@@ -9,40 +9,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from factorbus.cli.output.exits import INTERRUPTED
+from factorbus.stopping import STOPPING, listening, signalled, stop_on_signals
 
-_LOOK_S = 0.5
-_OURS = (signal.SIGTERM, signal.SIGINT)
 _ENDED = b"\x1b[?25h\ninterrupted\n"  # the cursor was hidden, if a bar was shown
 
 
 @contextmanager
-def stop_on_signals(until_eof: bool, on_stop: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
+def stop_when_asked(until_eof: bool, on_stop: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
     """An event that SIGTERM, SIGINT and, if asked for, the end of standard input set.  The second signal is final.
 
-    on_stop: called at the first signal.
+    on_stop: called at the first signal, in another thread.
     """
-    stop = threading.Event()
-
-    def on_signal(number: int, _frame: object) -> None:
-        if stop.is_set():
-            os._exit(INTERRUPTED)
-        stop.set()
-        on_stop()
-
-    before = {number: signal.signal(number, on_signal) for number in _OURS}
-    if until_eof:
-        threading.Thread(target=_wait_for_eof, args=(stop,), daemon=True).start()
-    try:
+    with stop_on_signals(on_stop, exit_code=INTERRUPTED) as stop:
+        if until_eof:
+            threading.Thread(target=_wait_for_eof, args=(stop,), daemon=True).start()
         yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def wait_until(stop: threading.Event) -> None:
-    """Until it is set.  No wait in it is long: Python sees a signal that comes right before one only when it ends."""
-    while not stop.wait(_LOOK_S):
-        pass
 
 
 @contextmanager
@@ -57,16 +38,11 @@ def interrupt_on_sigterm(grace_s: float = 10.0) -> Iterator[None]:
     def on_signal(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, on_signal) for number in _OURS}
-    told, tell = socket.socketpair()
-    tell.setblocking(False)
-    told_before = signal.set_wakeup_fd(tell.fileno())  # told of by the C part of Python, whatever the main thread does
-    threading.Thread(target=_see_to_the_end, args=(told, grace_s), daemon=True).start()
+    before = {number: signal.signal(number, on_signal) for number in STOPPING}
     try:
-        yield
+        with listening(lambda told: _see_to_the_end(told, grace_s)):
+            yield
     finally:
-        signal.set_wakeup_fd(told_before)
-        tell.close()
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -82,14 +58,6 @@ def _see_to_the_end(told: socket.socket, grace_s: float) -> None:
                 return
         os.write(sys.stderr.fileno(), _ENDED)
         os._exit(INTERRUPTED)
-
-
-def signalled(told: socket.socket) -> bool:
-    """Wait for the next of our signals; False when there is nothing left to end.  Raises TimeoutError."""
-    while number := told.recv(1):
-        if number[0] in _OURS:
-            return True
-    return False
 
 
 def leave_on_eof() -> None:
