@@ -25,6 +25,18 @@ def test_a_wide_budget_leaves_nothing_and_a_tight_one_does() -> None:
         assert "manhattan" in shown(row)
 
 
+def test_the_rival_holds_back_what_does_not_fit() -> None:
+    pytest.importorskip("gtsam")
+    wide, tight = (compare(WORLD, budget_ms, with_rival=True)["rival"] for budget_ms in (1000.0, 0.02))
+    for rival in (wide, tight):
+        assert not rival["failed"]
+        assert rival["chi2_ratio"]["p50"] > 1.0 - 1e-6, "nothing is below the optimum"
+    assert wide["held_back_share"] == 0.0
+    assert wide["chi2_ratio"]["p50"] < 1.001
+    assert tight["held_back_share"] > 0.5
+    assert tight["chi2_ratio"]["p95"] > wide["chi2_ratio"]["p95"]
+
+
 def test_stretches_are_runs_of_steps() -> None:
     assert stretches([True, True, False, True]) == {"p50": 1.5, "p99": pytest.approx(1.99), "share": 0.75}
     assert stretches([False, False]) == {"p50": 0.0, "p99": 0.0, "share": 0.0}

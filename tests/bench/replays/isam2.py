@@ -64,10 +64,14 @@ class Isam2:
         return self._graph, self._values
 
     def step(self) -> None:
-        """Raises Failed: an indeterminate system comes as RuntimeError."""
+        """Raises Failed."""
+        self._update()
+
+    def _update(self, *beside: Any) -> None:
+        """With the newest pose.  Raises Failed: an indeterminate system comes as RuntimeError."""
         kind, key = self._last_pose
         try:
-            self._result = self._isam.update(self._graph, self._values)
+            self._result = self._isam.update(self._graph, self._values, *beside)
             if kind == "se2":
                 self._isam.calculateEstimatePose2(key)
             else:
