@@ -7,17 +7,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from factorbus.proto.codec import decode_map
 from factorbus.service.core.budget import (
     CLIPPED,
     FAR,
+    LARGE,
     LEAST_SHARE,
     MOST_DOUBLED,
     SLOWER,
+    SMALL,
     USUAL_UNITS_PER_MS,
     StepBudget,
 )
 from factorbus.service.core.converging import CONVERGE_IDLE_S, POLISH_IDLE_S, Converging
-from factorbus.service.core.events import BudgetUse, Stepped
+from factorbus.service.core.events import BudgetUse, Publish, Stepped
 from factorbus.service.maps.work_rate import measured_rate
 
 rates = st.floats(1e5, 1e11)
@@ -152,3 +155,25 @@ def test_what_is_left_is_begun_with_before_a_map_is_polished(complete: bool, idl
 
 def test_the_rate_of_this_machine_is_measured() -> None:
     assert 1e4 < measured_rate() < 1e13
+
+
+@given(st.lists(st.tuples(st.one_of(st.floats(0.0, 20.0), st.just(math.inf)), st.booleans()), max_size=40))
+def test_a_large_correction_is_said_to_come_and_then_to_have_arrived(steps: list[tuple[float, bool]]) -> None:
+    budget, coming = StepBudget(5.0), False
+    for revision, (unsolved, complete) in enumerate(steps, 1):
+        budget.stepped(step(1e8, 1.0, 5e8, unsolved=unsolved, complete=complete))
+        left = 0.0 if complete else unsolved
+        expected = []
+        if (left < SMALL) if coming else (left >= LARGE):
+            coming = not coming
+            state, bound = "coming" if coming else "arrived", left if left < math.inf else None
+            expected = [{"event": "correction", "epoch": 7, "revision": revision, "state": state, "unsolved": bound}]
+        told = budget.correction(7, revision)
+        assert [decode_map(each.message) for each in told if isinstance(each, Publish)] == expected
+        assert len(told) == len(expected)
+
+
+def test_without_a_budget_no_correction_is_said_to_come() -> None:
+    budget = StepBudget()
+    budget.stepped(step(1e9, 1e3, 1e9, unsolved=100.0, complete=False))
+    assert budget.correction(7, 1) == []

@@ -4,6 +4,7 @@ FACTORBUS_KILLS says how often a service is killed; here fewer, to save time.
 """
 
 import os
+import queue
 import random
 import signal
 import subprocess
@@ -14,14 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from bare import bare
 from journalled import Services, Stream, rows
 from processes import PATIENCE_S
 from replicas import MAP, Link, check_equal, replica_settings, wait_until_level
+from zenoh.handlers import Callback
 
 from factorbus.client import Map, Refused, connect
 from factorbus.journal.store import open_store
+from factorbus.proto import codec, keys
 from factorbus.proto.messages import Batch
 from factorbus.service.config import Limits
+from factorbus.service.core.budget import LARGE
 from factorbus.service.journal.library import make_map_solver
 from factorbus.service.journal.recovery import verify
 from factorbus.service.questions.answers import Question
@@ -150,6 +155,30 @@ def test_what_is_told_and_settled(services: Callable[..., Services], tmp_path: P
             report = driven.insert(batches[0]).report
             assert not {"budget", "budget_ms", "deferred_relinearizations"} & set(report)
             assert "budget" not in driven.stats()
+
+
+def test_a_large_correction_is_said_to_come_and_to_have_arrived(
+    services: Callable[..., Services], tmp_path: Path
+) -> None:
+    """In turn, by events behind the deltas of their steps; at the end, when nothing is left, it has arrived."""
+    endpoint = services(tmp_path / "j", f"budget_ms={TIGHT_MS}").start()
+    told: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    with bare(endpoint) as client, connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus:
+        hear = Callback(lambda sample: told.put(codec.decode_map(sample.payload.to_bytes())), indirect=False)
+        client.session.declare_subscriber(keys.event_key("m"), hear)
+        with bus.map("m") as driven:
+            reports = {done.revision: done.report for done in map(driven.insert, driven_batches(400))}
+            assert any(not r["complete"] and r["unsolved"] >= LARGE for r in reports.values())
+            driven.settle()
+        states: list[str] = []
+        while states[-1:] != ["arrived"] or not told.empty():
+            event = told.get(timeout=PATIENCE_S)
+            if event["event"] != "correction":
+                continue
+            states.append(event["state"])
+            if event["state"] == "coming" and event["revision"] in reports:
+                assert event["unsolved"] == reports[event["revision"]]["unsolved"] >= LARGE
+    assert states == ["coming", "arrived"] * (len(states) // 2)
 
 
 def test_a_fork_in_the_middle_goes_on_with_the_same_budget(services: Callable[..., Services], tmp_path: Path) -> None:

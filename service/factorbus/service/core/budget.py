@@ -14,13 +14,15 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from factorbus.service.core.events import BudgetUse, Stepped
+from factorbus.proto import codec
+from factorbus.service.core.events import BudgetUse, Effect, Publish, Stepped
 
 USUAL_UNITS_PER_MS = 1e8  # where nothing was measured
 SLOWER, FASTER, CLIPPED = 0.06, 0.02, 0.5
 FAR = 8.0  # times what was measured at the start, either way: beyond it nothing is believed
 LEAST_SHARE = 0.1  # of its budget that a step has to use: of shorter ones much is not counted in units
 MOST_DOUBLED = 6  # times, in further steps of no use; after that they have no bound
+LARGE, SMALL = 9.0, 1.0  # of χ²: what is left may move a variable by 3 of its standard deviations; by no more than 1
 _NONE = BudgetUse()
 
 
@@ -31,6 +33,7 @@ class StepBudget:
         self.budget_ms, self.units_per_ms = budget_ms, units_per_ms
         self._began = units_per_ms
         self._use, self._step_ms = _NONE, 0.0
+        self._coming = False  # a large correction, and the event has gone out
 
     @property
     def complete(self) -> bool:
@@ -57,6 +60,21 @@ class StepBudget:
         self._use, self._step_ms = stepped.use or _NONE, stepped.step_ms
         if stepped.use is not None and stepped.strategy != "batch":  # what replaces a step is not counted in units
             self._follow(stepped.use, stepped.step_ms)
+
+    def correction(self, epoch: int, revision: int) -> list[Effect]:
+        """The event `correction` after a step: a large one is coming now, or has arrived."""
+        left = 0.0 if self._use.complete else self._use.unsolved
+        if left >= SMALL if self._coming else left < LARGE:
+            return []
+        self._coming = not self._coming
+        told = {
+            "event": "correction",
+            "epoch": epoch,
+            "revision": revision,
+            "state": "coming" if self._coming else "arrived",
+            "unsolved": left if left < math.inf else None,
+        }
+        return [Publish("event", codec.encode_map(told))]
 
     def _follow(self, use: BudgetUse, step_ms: float) -> None:
         if not step_ms > 0.0 or not use.work >= LEAST_SHARE * use.budget or not use.work > 0.0:

@@ -169,6 +169,7 @@ class MapCore:
         self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2, stepped.use)
         self._moved_at = stepped.revision
         self._budget.stepped(stepped)
+        others += self._budget.correction(self.epoch, self.revision)
         self._free(applied, 1)
         return self._go_on(others, applied.now)
 
@@ -223,7 +224,7 @@ class MapCore:
         else:
             self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2, stepped.use)
             self._moved_at = stepped.revision
-        return [Publish("delta", stepped.delta)]
+        return [Publish("delta", stepped.delta), *self._budget.correction(self.epoch, self.revision)]
 
     def grafted(
         self, inserts: Iterable[tuple[str, int, int, object]], steps: Iterable[Stepped],
