@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 from bare import bare
 from journalled import Services, Stream, rows
 from processes import PATIENCE_S
@@ -163,9 +164,12 @@ def test_a_large_correction_is_said_to_come_and_to_have_arrived(
     """In turn, by events behind the deltas of their steps; at the end, when nothing is left, it has arrived."""
     endpoint = services(tmp_path / "j", f"budget_ms={TIGHT_MS}").start()
     told: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+
+    def hear(sample: zenoh.Sample) -> None:
+        told.put(codec.decode_map(sample.payload.to_bytes()))
+
     with bare(endpoint) as client, connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus:
-        hear = Callback(lambda sample: told.put(codec.decode_map(sample.payload.to_bytes())), indirect=False)
-        client.session.declare_subscriber(keys.event_key("m"), hear)
+        client.session.declare_subscriber(keys.event_key("m"), Callback(hear, indirect=False))
         with bus.map("m") as driven:
             reports = {done.revision: done.report for done in map(driven.insert, driven_batches(400))}
             assert any(not r["complete"] and r["unsolved"] >= LARGE for r in reports.values())
