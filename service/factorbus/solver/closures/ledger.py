@@ -22,6 +22,7 @@ CLOSURE_STATES: tuple[str, ...] = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 BELIEVED = {ACCEPTED, RESTORED}
+_ROOM = 256  # closures, from the first: to make more means new pages for ten columns
 _BURST = 10  # closures that one mistake brings
 _COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_new", "is_tested", "is_improbable", "is_rival")
 
@@ -141,8 +142,21 @@ class Ledger:
             self.accepted += closure.state == ACCEPTED
         self.closures += new
 
+    def enter_accepted(self, new: Sequence[Closure], ends: I64, looked: int, z: F64, noise: F64, bound: F64) -> None:
+        """The same of several that are all accepted, in rows which they know."""
+        n, count = len(self.closures), len(self.closures) + len(new)
+        self._make_room(count)
+        own = slice(n, count)
+        self.ends[own], self.looked[own], self.z[own] = ends, looked, z
+        self.noise[own], self.bound[own] = noise, bound
+        self.is_suspect[own] = self.is_new[own] = False
+        self.is_tested[own] = True
+        self.accepted += len(new)
+        self.closures += new
+
     def _make_room(self, need: int) -> None:
         if need > len(self.z):
+            need = max(need, _ROOM)
             for name in _COLUMNS:
                 setattr(self, name, with_room(getattr(self, name), need))
 
@@ -228,6 +242,20 @@ class ClosureLedger:
         self.of_factor |= {closure.factor_id: closure for closure in new}
         for closure in new:
             self._counts[closure.state] += 1
+
+    def enter_accepted(self, kind: str, new: Sequence[Closure], ends: I64, z: F64, noise: F64, bound: F64) -> None:
+        """The same of several that are all accepted, in rows which they know."""
+        self.looks += 1
+        self.moved_at = self.looks
+        self.of_kind[kind].enter_accepted(new, ends, self.looks, z, noise, bound)
+        for closure in new:
+            self.of_factor[closure.factor_id] = closure
+        self._counts[ACCEPTED] += len(new)
+
+    @property
+    def has_suspects(self) -> bool:
+        """Whether any is one."""
+        return self._counts[SUSPECT] > 0
 
     def named(self, factors: Iterable[int]) -> list[Closure]:
         """Those with these ids.  Raises NotAClosure."""

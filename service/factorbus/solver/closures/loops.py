@@ -69,18 +69,25 @@ class TrustedForest:
         """Join what trusted factors of a batch join; gives them, and those that close loops."""
         self._begin(batch)
         waiting, count = list[tuple[FactorsLike, int, int, int, int]](), 0
+        above, sizes, linked = self._above, self._sizes, self._linked
         for group in batch.factors:
             rows = group.keys.tolist()
-            if group.kind in POSES_BETWEEN and not getattr(group, "trusted", False):
-                for k, (i, j) in enumerate(rows):
-                    if -1 <= i - j <= 1 and i != j:
-                        self._join(i, j)
-                    else:
-                        waiting.append((group, k, count + k, i, j))
-            else:
+            if group.kind not in POSES_BETWEEN or getattr(group, "trusted", False):
                 self._join_rows(rows)
+                count += len(rows)
+                continue
+            for k, (i, j) in enumerate(rows, count):
+                if not (i - j == -1 or i - j == 1):
+                    waiting.append((group, k - count, k, i, j))
+                elif j not in above and (root := above.get(i)) is not None and above[root] == root:
+                    # The next pose of what hangs together, as nearly every one is: what `_join` would do.
+                    above[j], sizes[j] = root, 1
+                    sizes[root] += 1
+                    linked.append((j, root))
+                else:
+                    self._join(i, j)
             count += len(rows)
-        closing = [one for one in waiting if not self._join(one[3], one[4])]
+        closing = [one for one in waiting if not self._join(one[3], one[4])] if waiting else waiting
         if not closing:
             return SplitFactors(batch.factors, count, [], _NOWHERE)
         closing_at = np.array([one[2] for one in closing])

@@ -16,12 +16,11 @@ class Live:
     def __init__(self, graph: FactorGraph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
 
-    def joint(self, variables: I64) -> F64:
-        """(d, d): of different free variables together, in their order."""
-        tree, var = self._tree, self._graph.var
-        size = 0
-        for v in variables.tolist():
-            size += int(DIMS[var[v, at.V_KIND]])
+    def joint(self, variables: I64, scalars: int | None = None) -> F64:
+        """(d, d): of different free variables together, in their order; scalars: d, where that is known."""
+        tree, var, size = self._tree, self._graph.var, scalars
+        if size is None:
+            size = sum(int(DIMS[var[v, at.V_KIND]]) for v in variables.tolist())
         out = np.empty((size, size))
         joint_block(variables, var, DIMS, tree.array_table, out)
         return out

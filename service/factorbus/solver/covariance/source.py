@@ -50,9 +50,9 @@ class CovarianceSource:
         """What keeps all diagonal blocks of the covariance up, updated after every step.  None: as for `try_view`."""
         return Upkeep(self._graph, self._tree) if self._tree else None
 
-    def try_joint(self, variables: I64) -> F64 | None:
+    def try_joint(self, variables: I64, scalars: int | None = None) -> F64 | None:
         """The joint covariance of a few different free variables (by index) as of the last step, read from R in place.
 
-        None: as for `try_view`.
+        scalars: of all of them, where that is known.  None: as for `try_view`.
         """
-        return self._live.joint(variables) if self._live else None
+        return self._live.joint(variables, scalars) if self._live else None
