@@ -153,15 +153,13 @@ def _foresee(solver: Solver, split: SplitFactors, closing: I64, before: Mark, vo
     for factor in split.closing:
         if factor.kind != _PLANE:
             return None
-    free, ends, moved = np.empty(2 * n, np.int64), np.empty((2 * n, 2), np.int64), np.empty((2 * n, ahead.MOVED))
+    free, ends, moved = np.empty(2 * n, np.int64), np.empty((2 * n, ahead.END_COLUMNS), np.int64), np.empty((2 * n, ahead.MOVED))
     table = graph.array_table
     count = ahead.list_closure_ends(before[at.VARIABLES], before[at.FACTORS], closing, table, free, ends, moved)
     if count < 0 or (known := solver.covariances.try_joint(free[:count], _PLANE_DIM * count)) is None:
         return None
     numbers = np.empty((n, ahead.J_SIZE, 3))
     ahead.judge_ahead(closing, table, ends, moved, known, numbers)
-    distance, chance = list[float](), list[float]()
-    for d2, right, _ in numbers[:, 0].tolist():
-        distance.append(d2)
-        chance.append(min(right / volume, 1.0))
-    return Foreseen(numbers, graph.fac[closing, at.F_I : at.F_J + 1], distance, chance)
+    told = numbers[:, 0].tolist()
+    distance, chance = [one[0] for one in told], [min(one[1] / volume, 1.0) for one in told]
+    return Foreseen(numbers, ends[:, ahead.END_ITSELF].reshape(n, 2), distance, chance)

@@ -51,7 +51,7 @@ from factorbus.solver.closures.switching import without_factors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.errors import SolverError
 from factorbus.solver.kernels.closures.ahead import list_companions, weigh_residuals
-from factorbus.solver.kernels.closures.back import bound_without, list_free_ends
+from factorbus.solver.kernels.closures.back import bound_without, list_free_ends, list_worst
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
@@ -126,12 +126,9 @@ class ClosureJudge:
         if not tested.size:
             return None
         out = self.limits[ledger.dim].out
-        most_likely = residuals_weighed(solver, ledger, tested)
-        worst = np.flatnonzero(~(most_likely <= out))
+        worst = _worst(solver, ledger, tested, out)
         if not worst.size:
             return None
-        order = np.argsort(-np.nan_to_num(most_likely[worst], nan=np.inf), kind="stable")
-        worst = tested[worst[order[:_WORST]]]
         _bound_anew(solver, ledger, worst)
         d2 = residuals_weighed(solver, ledger, worst)
         if float(d2.max()) <= out:
@@ -302,6 +299,17 @@ def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:
     now = closure_numbers(solver, ledger, rows, False)
     r = tangent_of(inverse_motion(now.z) @ inverse_motion(now.a) @ now.b)
     return np.einsum("na,nab,nb->n", r, ledger.bound[rows], r)
+
+
+def _worst(solver: Solver, ledger: Ledger, tested: I64, out: float) -> I64:
+    """The worst first of those whose d² is beyond `out` by their bounds."""
+    if ledger.dim == _PLANE_DIM:
+        found, distance, table = np.empty(_WORST, np.int64), np.empty(_WORST), solver._graph.array_table
+        return found[: list_worst(tested, ledger.ends, ledger.z, ledger.bound, table, out, found, distance)]
+    most_likely = residuals_weighed(solver, ledger, tested)
+    worst = np.flatnonzero(~(most_likely <= out))
+    order = np.argsort(-np.nan_to_num(most_likely[worst], nan=np.inf), kind="stable")
+    return tested[worst[order[:_WORST]]]
 
 
 def _bound_anew(solver: Solver, ledger: Ledger, rows: I64) -> None:

@@ -38,7 +38,7 @@ class Closure:
 
     factor_id: int
     row: int
-    factor: FactorGroup
+    factor: FactorsLike
     came: int
     state: str = SUSPECT
     reason: str = NEW
@@ -149,8 +149,7 @@ class Ledger:
         own = slice(n, count)
         self.ends[own], self.looked[own], self.z[own] = ends, looked, z
         self.noise[own], self.bound[own] = noise, bound
-        self.is_suspect[own] = self.is_new[own] = False
-        self.is_tested[own] = True
+        self.is_tested[own] = True  # what else they may be is zero in new room
         self.accepted += len(new)
         self.closures += new
 
@@ -160,7 +159,7 @@ class Ledger:
             for name in _COLUMNS:
                 setattr(self, name, with_room(getattr(self, name), need))
 
-    def measure(self, closure: Closure, factor: FactorGroup) -> None:
+    def measure(self, closure: Closure, factor: FactorsLike) -> None:
         """What it measures, and how well."""
         closure.factor = factor
         self.z[closure.row] = motions_of_poses(factor.measured)[0]
@@ -225,7 +224,7 @@ class ClosureLedger:
         """How many are in each state."""
         return dict(self._counts)
 
-    def add(self, factor: FactorGroup, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
+    def add(self, factor: FactorsLike, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
         """A new one: a suspect that nobody has looked at."""
         closure = Closure(factor_id, 0, factor, revision, changed=revision)
         self.of_kind[factor.kind].add(closure, [graph.find(key) for key in closure.keys], self.looks)
@@ -383,7 +382,7 @@ def pick_rows(group: FactorsLike, chosen: np.ndarray | I64) -> FactorGroup:
     return FactorGroup(group.kind, *picked, group.loss, scale)
 
 
-def _noise(factor: FactorGroup, d: int) -> F64:
+def _noise(factor: FactorsLike, d: int) -> F64:
     """Ω⁻¹ in metres and radians: the residual of a rotation in space is half its angle."""
     omega = np.zeros((d, d))
     rows, columns = np.triu_indices(d)

@@ -1,12 +1,44 @@
 """Loop closures in the plane that the map has, against the map without them, read from its columns in place."""
 
+import math
+
 import numpy as np
 
-from factorbus.solver.kernels.closures.ahead import pose_of
+from factorbus.solver.kernels.closures.ahead import pose_of, residual_weighed
 from factorbus.solver.kernels.closures.plane import add_predicted, motion_to, put_adjoint, put_weight_without
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import graph_at
+
+
+@kernel(
+    "int64(int64[::1], int64[:,::1], float64[:,:,::1], float64[:,:,::1], int64[::1], float64, int64[::1], float64[::1])"
+)
+def list_worst(
+    rows: I64, ends: I64, z: F64, weights: F64, graph_table: I64, most: float, found: I64, distance: F64
+) -> int:
+    """Those with the largest rᵀ W r, of `weigh_residuals`, that are beyond `most`; gives how many there are.
+
+    out  found, distance (k,): the worst first, of equal ones the first of `rows`; NaN is infinite
+    """
+    graph = graph_at(graph_table)
+    var, values, count = graph.var, graph.values, 0
+    for k in range(rows.size):
+        d2 = residual_weighed(rows[k], ends, z, weights, var, values)
+        if d2 <= most:
+            continue
+        if math.isnan(d2):
+            d2 = math.inf
+        place = min(count, found.size)
+        while place > 0 and distance[place - 1] < d2:
+            place -= 1
+        if place == found.size:
+            continue
+        count = min(count + 1, found.size)
+        for p in range(count - 1, place, -1):
+            found[p], distance[p] = found[p - 1], distance[p - 1]
+        found[place], distance[place] = rows[k], d2
+    return count
 
 
 @kernel("int64(int64[::1], int64[:,::1], int64[::1], int64[::1], int64[:,::1])")
