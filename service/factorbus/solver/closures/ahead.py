@@ -21,14 +21,14 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
 
-_PLANE, _PLANE_DIM = "between_se2", 3
+_PLANE = "between_se2"
 
 
 class Foreseen(NamedTuple):
     """What the map expects of some closures: their judgements as `judge_ahead` has them, and d² and odds of each."""
 
     numbers: F64
-    ends: I64
+    ends: I64  # as `list_closure_ends` has them
     distance: list[float]
     chance: list[float]
 
@@ -125,7 +125,7 @@ def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, 
         else:
             made.append(Closure(first + place, 0, split.closing[k], revision, changed=revision))
     z, noise = seen.numbers[:, ahead.J_MEASURED :], seen.numbers[:, ahead.J_NOISE : ahead.J_WEIGHT]
-    ledgers.enter(_PLANE, made, seen.ends, z, noise, bounds)
+    ledgers.enter(_PLANE, made, seen.ends[:, ahead.END_ITSELF].reshape(-1, 2), z, noise, bounds)
     return made
 
 
@@ -139,8 +139,7 @@ def _enter_expected(
         Closure(first + place, n, factor, revision, ACCEPTED, PASSED, d2, p, revision)
         for n, (factor, place, d2, p) in enumerate(each, row)
     ]
-    z, noise = numbers[:, ahead.J_MEASURED :], numbers[:, ahead.J_NOISE : ahead.J_WEIGHT]
-    ledgers.enter_accepted(_PLANE, made, seen.ends, z, noise, numbers[:, ahead.J_BOUND : ahead.J_MEASURED])
+    ledgers.enter_accepted(_PLANE, made, seen.ends, numbers)
     return made
 
 
@@ -149,17 +148,13 @@ def _foresee(solver: Solver, split: SplitFactors, closing: I64, before: Mark, vo
 
     volume: where false ones are.
     """
-    n, graph = closing.size, solver._graph
     for factor in split.closing:
         if factor.kind != _PLANE:
             return None
-    free, ends, moved = np.empty(2 * n, np.int64), np.empty((2 * n, ahead.END_COLUMNS), np.int64), np.empty((2 * n, ahead.MOVED))
-    table = graph.array_table
-    count = ahead.list_closure_ends(before[at.VARIABLES], before[at.FACTORS], closing, table, free, ends, moved)
-    if count < 0 or (known := solver.covariances.try_joint(free[:count], _PLANE_DIM * count)) is None:
+    n = closing.size
+    ends, numbers = np.empty((2 * n, ahead.END_COLUMNS), np.int64), np.empty((n, ahead.J_SIZE, 3))
+    if not solver.covariances.try_foresee(before[at.VARIABLES], before[at.FACTORS], closing, ends, numbers):
         return None
-    numbers = np.empty((n, ahead.J_SIZE, 3))
-    ahead.judge_ahead(closing, table, ends, moved, known, numbers)
     told = numbers[:, 0].tolist()
     distance, chance = [one[0] for one in told], [min(one[1] / volume, 1.0) for one in told]
-    return Foreseen(numbers, ends[:, ahead.END_ITSELF].reshape(n, 2), distance, chance)
+    return Foreseen(numbers, ends, distance, chance)

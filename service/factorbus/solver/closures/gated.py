@@ -58,21 +58,22 @@ class GatedSolver:
         try:
             if split.closing:
                 staged = stage_with_believed(self.solver, self.ledger, batch, split, self.judge)
+                report, staged = self._step(batch, staged)
             else:
                 self.solver.stage(batch)
-            report, staged = self._step(batch, staged)
+                report = self.solver.step()
         except SolverError:
             self._joined.forget()
             raise
         self._steps += 1
         return GatedReport(report) if staged is None else self._judged(report, staged)
 
-    def _step(self, batch: BatchLike, staged: StagedBatch | None) -> tuple[StepReport, StagedBatch | None]:
+    def _step(self, batch: BatchLike, staged: StagedBatch) -> tuple[StepReport, StagedBatch]:
         """The step of what is staged; where it fails with closures, that without them."""
         try:
             return self.solver.step(), staged
         except SolverError:
-            if staged is None or not any(staged.believed):
+            if not any(staged.believed):
                 raise
             staged = staged._replace(believed=[False] * len(staged.believed), all_in=False)
             restage(self.solver, batch, staged)

@@ -14,6 +14,7 @@ from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.factor_graph import FactorGraph, with_room
 from factorbus.solver.graph.groups import FactorGroup, FactorsLike
+from factorbus.solver.kernels.closures.ahead import enter_judged
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.wording import counted
 
@@ -142,14 +143,12 @@ class Ledger:
             self.accepted += closure.state == ACCEPTED
         self.closures += new
 
-    def enter_accepted(self, new: Sequence[Closure], ends: I64, looked: int, z: F64, noise: F64, bound: F64) -> None:
-        """The same of several that are all accepted, in rows which they know."""
-        n, count = len(self.closures), len(self.closures) + len(new)
-        self._make_room(count)
-        own = slice(n, count)
-        self.ends[own], self.looked[own], self.z[own] = ends, looked, z
-        self.noise[own], self.bound[own] = noise, bound
-        self.is_tested[own] = True  # what else they may be is zero in new room
+    def enter_accepted(self, new: Sequence[Closure], ends: I64, looked: int, judged: F64) -> None:
+        """The same of several that are all accepted, in rows which they know, as `judge_ahead` has judged them."""
+        n = len(self.closures)
+        self._make_room(n + len(new))
+        enter_judged(n, judged, ends, self.z, self.noise, self.bound, self.ends)
+        self.looked[n : n + len(new)], self.is_tested[n : n + len(new)] = looked, True
         self.accepted += len(new)
         self.closures += new
 
@@ -242,11 +241,11 @@ class ClosureLedger:
         for closure in new:
             self._counts[closure.state] += 1
 
-    def enter_accepted(self, kind: str, new: Sequence[Closure], ends: I64, z: F64, noise: F64, bound: F64) -> None:
-        """The same of several that are all accepted, in rows which they know."""
+    def enter_accepted(self, kind: str, new: Sequence[Closure], ends: I64, judged: F64) -> None:
+        """The same of several that are all accepted, in rows which they know, as `judge_ahead` has judged them."""
         self.looks += 1
         self.moved_at = self.looks
-        self.of_kind[kind].enter_accepted(new, ends, self.looks, z, noise, bound)
+        self.of_kind[kind].enter_accepted(new, ends, self.looks, judged)
         for closure in new:
             self.of_factor[closure.factor_id] = closure
         self._counts[ACCEPTED] += len(new)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from factorbus.solver.bayes_tree.tree import CliqueTree
+from factorbus.solver.covariance.kernels.foreseen import foresee_closures
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.square_root import DIMS
 from factorbus.solver.graph.factor_graph import FactorGraph
@@ -15,6 +16,11 @@ class Live:
 
     def __init__(self, graph: FactorGraph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
+
+    def foresee(self, v0: int, f0: int, closing: I64, ends: I64, out: F64) -> int:
+        """See `foresee_closures`."""
+        tables = self._graph.array_table, self._tree.array_table
+        return foresee_closures(v0, f0, closing, *tables, DIMS, ends, out)
 
     def joint(self, variables: I64, scalars: int | None = None) -> F64:
         """(d, d): of different free variables together, in their order; scalars: d, where that is known."""

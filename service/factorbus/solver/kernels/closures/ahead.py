@@ -37,7 +37,8 @@ def list_closure_ends(v0: int, f0: int, closing: I64, graph_table: I64, free: I6
     """Where the ends of closures lead back to; gives how many free poses those are, −1: it is not by odometry alone.
 
     in   v0, f0: variables and factors that the last step had  closing (n,): rows of factors, ascending
-    out  free: poses, each once  ends (2 n, END_COLUMNS)  moved (2 n, MOVED): of first and second end, one after the other
+    out  free: poses, each once
+         ends (2 n, END_COLUMNS), moved (2 n, MOVED): of first and second end, one after the other
     """
     graph = graph_at(graph_table)
     var, fac, payload, counts = graph.var, graph.fac, graph.payload, graph.counts
@@ -150,6 +151,24 @@ def judge_ahead(closing: I64, graph_table: I64, ends: I64, moved: F64, known: F6
             for c in range(3):
                 own[J_BOUND + r, c] = 0.0
         add_predicted(own[J_WEIGHT : J_WEIGHT + 3], 0, 0, 0, 0, own[J_ALLOWED : J_ALLOWED + 3], own[J_BOUND:])
+
+
+@kernel(
+    "void(int64, float64[:,:,::1], int64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], int64[:,::1])"
+)
+def enter_judged(first: int, judged: F64, of: I64, z: F64, noise: F64, bound: F64, ends: I64) -> None:
+    """Write closures into the columns of a ledger, from row `first` on.
+
+    in   judged, of: `out` of `judge_ahead`, and its `ends`
+    out  the columns: what was measured, Ω⁻¹, bounds, ends
+    """
+    for k in range(len(judged)):
+        n = first + k
+        for r in range(3):
+            for c in range(3):
+                z[n, r, c], noise[n, r, c] = judged[k, J_MEASURED + r, c], judged[k, J_NOISE + r, c]
+                bound[n, r, c] = judged[k, J_BOUND + r, c]
+        ends[n, 0], ends[n, 1] = of[2 * k, END_ITSELF], of[2 * k + 1, END_ITSELF]
 
 
 @kernel("void(int64[::1], int64[:,::1], float64[:,:,::1], float64[:,:,::1], int64[::1], float64[::1])")
