@@ -133,3 +133,15 @@ def test_closures_have_arrays_of_their_own(rows: int) -> None:
     for found, whole in ((closing.keys, keys), (closing.measured, group.measured), (closing.scale, group.scale)):
         np.testing.assert_array_equal(found, whole[-1:])  # pyright: ignore[reportOptionalSubscript]
     np.testing.assert_array_equal(closing.information, group.information[-1:])
+
+
+def test_a_look_is_due_at_every_eighth_and_while_any_is_a_suspect() -> None:
+    judge, ledger = GatedSolver(Options()).judge, ClosureLedger()
+    due = []
+    for ledger.looks in range(1, 25):
+        due += [ledger.looks] * (not judge.is_settled(ledger))
+    assert due == [8, 16, 24]
+    made = driven(300, 0.5)
+    assert made.suspects()
+    for made.ledger.looks in range(1000, 1016):
+        assert not made.judge.is_settled(made.ledger)
