@@ -142,7 +142,7 @@ class ClosureJudge:
 
     def _chosen(self, solver: Solver, ledger: Ledger, rows: I64, all_together: bool = False) -> Chosen:
         """Among rows."""
-        extent = self._extent(solver, ledger)
+        extent = self._extent(solver, ledger) if rows.size > 1 else 0.0  # which one by itself does not need
         return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds(), all_together)
 
     def _extent(self, solver: Solver, ledger: Ledger) -> float:
