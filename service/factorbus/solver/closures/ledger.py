@@ -143,11 +143,11 @@ class Ledger:
             self.accepted += closure.state == ACCEPTED
         self.closures += new
 
-    def enter_accepted(self, new: Sequence[Closure], ends: I64, looked: int, judged: F64) -> None:
-        """The same of several that are all accepted, in rows which they know, as `judge_ahead` has judged them."""
+    def enter_accepted(self, new: Sequence[Closure], ends: I64, looked: int, numbers: F64) -> None:
+        """The same of several that are all accepted, in rows which they know; numbers: of `judge_ahead`."""
         n = len(self.closures)
         self._make_room(n + len(new))
-        enter_judged(n, judged, ends, self.z, self.noise, self.bound, self.ends)
+        enter_judged(n, numbers, ends, self.z, self.noise, self.bound, self.ends)
         self.looked[n : n + len(new)], self.is_tested[n : n + len(new)] = looked, True
         self.accepted += len(new)
         self.closures += new
@@ -241,11 +241,11 @@ class ClosureLedger:
         for closure in new:
             self._counts[closure.state] += 1
 
-    def enter_accepted(self, kind: str, new: Sequence[Closure], ends: I64, judged: F64) -> None:
-        """The same of several that are all accepted, in rows which they know, as `judge_ahead` has judged them."""
+    def enter_accepted(self, kind: str, new: Sequence[Closure], ends: I64, numbers: F64) -> None:
+        """The same of several that are all accepted, in rows which they know; numbers: of `judge_ahead`."""
         self.looks += 1
         self.moved_at = self.looks
-        self.of_kind[kind].enter_accepted(new, ends, self.looks, judged)
+        self.of_kind[kind].enter_accepted(new, ends, self.looks, numbers)
         for closure in new:
             self.of_factor[closure.factor_id] = closure
         self._counts[ACCEPTED] += len(new)
