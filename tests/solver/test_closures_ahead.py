@@ -25,7 +25,7 @@ from factorbus.solver.closures.ledger import ACCEPTED, SUSPECT, Closure, Closure
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.closures.switching import without_factors
-from factorbus.solver.kernels.closures.ahead import J_ALLOWED, J_BOUND, J_MEASURED, J_NOISE
+from factorbus.solver.kernels.closures.ahead import END_ITSELF, J_ALLOWED, J_BOUND, J_MEASURED, J_NOISE
 from factorbus.solver.kernels.model import layout as at
 
 _SPREAD = FalseSpread(5.0, 0.5)
@@ -92,7 +92,7 @@ def test_before_the_step_a_closure_is_judged_as_after_it(new: int, partner: int)
     np.testing.assert_allclose(judged[J_MEASURED:], numbers.z[0], rtol=1e-12)
     assert foreseen.distance[0] == pytest.approx(after.distance[0], rel=1e-2)
     assert foreseen.chance[0] == pytest.approx(after.chance[0, 0], rel=5e-2)
-    ends = solver._graph.var[foreseen.ends[0], at.V_AT] // 3
+    ends = solver._graph.var[foreseen.ends[:, END_ITSELF], at.V_AT] // 3
     assert ends.tolist() == [partner, keys[-1]]
     # When it is in, what it was judged by says what the map is without it.
     solver.stage(Batch((), (closing,)))

@@ -204,7 +204,8 @@ class TestedMapSolver(MapSolver):
             went_in, moved = isinstance(failed, bytes), _moved(c for c in new if c.is_in)
             behind.append(self._entered(entry, moved) if went_in else Verdict((refusal(entry, failed),)))
         if new:
-            judged = [] if self._replaying else list(self._judged(new))
+            is_settled = staged is not None and staged.all_in and self._judge.is_settled(self._ledger)
+            judged = [] if self._replaying or is_settled else list(self._judged(new))
             counted = {**report, "closures": len(new), "suspects": sum(not c.is_in for c in new)}
             number = [(insert.sequence, outcome.first_factor)]
             (answer,) = self._messages.write_answers(number, self._epoch, self._revision, counted)

@@ -6,13 +6,11 @@ poses one after the other and nothing else; other closures are judged after a st
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from factorbus.solver.closures.choosing import PASSED
-from factorbus.solver.closures.evidence import volume_of
 from factorbus.solver.closures.judging import ClosureJudge
 from factorbus.solver.closures.ledger import ACCEPTED, NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.closures.loops import SplitFactors
@@ -30,17 +28,17 @@ class Foreseen(NamedTuple):
     """What the map expects of some closures: their judgements as `judge_ahead` has them, and d² and odds of each."""
 
     numbers: F64
-    ends: I64
+    ends: I64  # as `list_closure_ends` has them
     distance: list[float]
     chance: list[float]
 
 
-@dataclass(frozen=True, slots=True)
-class StagedBatch:
+class StagedBatch(NamedTuple):
     """A batch that waits for its step, with those of its closures that are believed already.
 
     first: the id of its first factor, were all in; row: where its first row is.  believed: of each closure.
     given: verdicts that say which are, as somebody who judged had them; None: they follow from `foreseen`.
+    all_in: whether all are believed.
     """
 
     split: SplitFactors
@@ -49,6 +47,7 @@ class StagedBatch:
     believed: Sequence[bool]
     foreseen: Foreseen | None
     given: ClosureVerdicts | None = None
+    all_in: bool = False
 
     def verdicts(self) -> ClosureVerdicts:
         """On those that are believed."""
@@ -75,17 +74,19 @@ def stage_with_believed(
     row, foreseen = before[at.FACTORS], None
     if given is None:
         rows = graph.rows_of(first + split.closing_at) if graph.counts.item(at.MEMBERS) else row + split.closing_at
-        foreseen = _foresee(solver, split, rows, before, volume_of(judge.limits[3].spread))
+        foreseen = _foresee(solver, split, rows, before, judge.volume)
     if foreseen is None:
         believed = np.isin(first + split.closing_at, () if given is None else given.factors).tolist()
     else:
         gate, out, _ = judge.limits[3]
         most = judge.policy.closure_chance_max / ledgers.of_kind[_PLANE].odds().false
         believed = [d2 <= gate and p <= most for d2, p in zip(foreseen.distance, foreseen.chance, strict=True)]
-        if any(d2 <= out and not is_in for d2, is_in in zip(foreseen.distance, believed, strict=True)):
+        if not all(believed) and any(
+            d2 <= out and not is_in for d2, is_in in zip(foreseen.distance, believed, strict=True)
+        ):
             believed = [False] * len(believed)  # it may speak against the others: they are judged together
-    staged = StagedBatch(split, first, row, believed, foreseen, given)
-    if not all(believed):
+    staged = StagedBatch(split, first, row, believed, foreseen, given, all(believed))
+    if not staged.all_in:
         graph.forget(before)
         restage(solver, batch, staged)
     return staged
@@ -100,8 +101,10 @@ def restage(solver: Solver, batch: BatchLike, staged: StagedBatch) -> None:
 def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, revision: int) -> list[Closure]:
     """The step of a batch is made: name its factors as if all were in, and write down its closures; gives those."""
     split, graph, first, seen = staged.split, solver._graph, staged.first, staged.foreseen
+    if staged.all_in and seen is not None:
+        return _enter_expected(ledgers, split, first, seen, revision)
     is_in = np.array(staged.believed)
-    if not is_in.all():
+    if not staged.all_in:
         places = np.concatenate([split.trusted_at, split.closing_at[is_in]])
         rows = np.arange(staged.row, graph.counts.item(at.FACTORS))
         graph.rename_last(first + places[graph.ids_of(rows) - first], first + split.count)
@@ -122,7 +125,21 @@ def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, 
         else:
             made.append(Closure(first + place, 0, split.closing[k], revision, changed=revision))
     z, noise = seen.numbers[:, ahead.J_MEASURED :], seen.numbers[:, ahead.J_NOISE : ahead.J_WEIGHT]
-    ledgers.enter(_PLANE, made, seen.ends, z, noise, bounds)
+    ledgers.enter(_PLANE, made, seen.ends[:, ahead.END_ITSELF].reshape(-1, 2), z, noise, bounds)
+    return made
+
+
+def _enter_expected(
+    ledgers: ClosureLedger, split: SplitFactors, first: int, seen: Foreseen, revision: int
+) -> list[Closure]:
+    """The same where all went in with the step, as the map expected."""
+    row, numbers = len(ledgers.of_kind[_PLANE].closures), seen.numbers
+    each = zip(split.closing, split.closing_at.tolist(), seen.distance, seen.chance, strict=True)
+    made = [
+        Closure(first + place, n, factor, revision, ACCEPTED, PASSED, d2, p, revision)
+        for n, (factor, place, d2, p) in enumerate(each, row)
+    ]
+    ledgers.enter_accepted(_PLANE, made, seen.ends, numbers)
     return made
 
 
@@ -131,16 +148,13 @@ def _foresee(solver: Solver, split: SplitFactors, closing: I64, before: Mark, vo
 
     volume: where false ones are.
     """
-    n, graph = closing.size, solver._graph
     for factor in split.closing:
         if factor.kind != _PLANE:
             return None
-    free, ends, moved = np.empty(2 * n, np.int64), np.empty((2 * n, 2), np.int64), np.empty((2 * n, ahead.MOVED))
-    table = graph.array_table
-    count = ahead.list_closure_ends(before[at.VARIABLES], before[at.FACTORS], closing, table, free, ends, moved)
-    if count < 0 or (known := solver.covariances.try_joint(free[:count])) is None:
+    n = closing.size
+    ends, numbers = np.empty((2 * n, ahead.END_COLUMNS), np.int64), np.empty((n, ahead.J_SIZE, 3))
+    if not solver.covariances.try_foresee(before[at.VARIABLES], before[at.FACTORS], closing, ends, numbers):
         return None
-    numbers = np.empty((n, ahead.J_SIZE, 3))
-    ahead.judge_ahead(closing, table, ends, moved, known, numbers)
-    chance = [min(right / volume, 1.0) for right in numbers[:, 0, 1].tolist()]
-    return Foreseen(numbers, graph.fac[closing, at.F_I : at.F_J + 1], numbers[:, 0, 0].tolist(), chance)
+    told = numbers[:, 0].tolist()
+    distance, chance = [one[0] for one in told], [min(one[1] / volume, 1.0) for one in told]
+    return Foreseen(numbers, ends, distance, chance)

@@ -69,6 +69,8 @@ def choose_closures(
     within = each.distance <= gate
     sure = within & (odds.false * each.chance[:, 0] <= policy.closure_chance_max)
     reasons = [PASSED if s else UNSURE if w else IMPROBABLE for s, w in zip(sure, within, strict=True)]
+    if len(within) == 1:  # which nothing agrees with
+        return Chosen(reasons, each.distance, each.chance[:, 0].copy(), [], each.allowed)
     sets = _Sets(c, gate, spreads, policy, each.chance[:, 1])
     among = np.flatnonzero((~sure | all_together) & (each.distance <= out))
     members, of_set = sets.believed(among, odds.mistaken)

@@ -7,7 +7,7 @@
 All of it follows from what was inserted: the same batches give the same verdicts, and the same bits.
 """
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.closures.ahead import StagedBatch, enter_closures, restage, stage_with_believed
@@ -23,8 +23,7 @@ from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
 
 
-@dataclass(frozen=True, slots=True)
-class GatedReport:
+class GatedReport(NamedTuple):
     """What one insert did: the report of its last step, and the closures whose state it changed.
 
     accepted: new ones, and suspects of before.  suspects: new ones.  contradicted: they were in, and are suspects.
@@ -59,29 +58,33 @@ class GatedSolver:
         try:
             if split.closing:
                 staged = stage_with_believed(self.solver, self.ledger, batch, split, self.judge)
+                report, staged = self._step(batch, staged)
             else:
                 self.solver.stage(batch)
-            report, staged = self._step(batch, staged)
+                report = self.solver.step()
         except SolverError:
             self._joined.forget()
             raise
         self._steps += 1
         return GatedReport(report) if staged is None else self._judged(report, staged)
 
-    def _step(self, batch: BatchLike, staged: StagedBatch | None) -> tuple[StepReport, StagedBatch | None]:
+    def _step(self, batch: BatchLike, staged: StagedBatch) -> tuple[StepReport, StagedBatch]:
         """The step of what is staged; where it fails with closures, that without them."""
         try:
             return self.solver.step(), staged
         except SolverError:
-            if staged is None or not any(staged.believed):
+            if not any(staged.believed):
                 raise
-            staged = replace(staged, believed=[False] * len(staged.believed))
+            staged = staged._replace(believed=[False] * len(staged.believed), all_in=False)
             restage(self.solver, batch, staged)
             return self.solver.step(), staged
 
     def _judged(self, report: StepReport, staged: StagedBatch) -> GatedReport:
         """The closures of a batch are written down and judged, now that the rest of it is in."""
-        new, moved = enter_closures(self.solver, self.ledger, staged, self._steps), dict[int, bool]()
+        new = enter_closures(self.solver, self.ledger, staged, self._steps)
+        if staged.all_in and self.judge.is_settled(self.ledger):
+            return GatedReport(report, tuple(new))
+        moved = dict[int, bool]()
         for verdicts in self.judge.looks(lambda: self.solver, self.ledger, new):
             for c in self.ledger.named(verdicts.factors.tolist()):
                 moved.setdefault(c.factor_id, c.is_in)

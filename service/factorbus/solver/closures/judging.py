@@ -33,6 +33,7 @@ from factorbus.solver.closures.evidence import (
     numbers_without,
     odds_of_weights,
     odds_without,
+    volume_of,
     weights_without,
 )
 from factorbus.solver.closures.ledger import (
@@ -50,6 +51,7 @@ from factorbus.solver.closures.switching import without_factors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.errors import SolverError
 from factorbus.solver.kernels.closures.ahead import list_companions, weigh_residuals
+from factorbus.solver.kernels.closures.back import bound_without, list_free_ends, list_worst
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
@@ -72,6 +74,11 @@ class ClosureJudge:
     def __init__(self, policy: ClosurePolicy | None = None) -> None:
         self.policy = policy or ClosurePolicy()
         self.limits = {dims: limits_of(self.policy, dims) for dims in (_PLANE_DIM, _SPACE_DIM)}
+        self.volume = volume_of(self.limits[_PLANE_DIM].spread)  # where false ones are
+
+    def is_settled(self, ledgers: ClosureLedger) -> bool:
+        """Whether `looks` has nothing to say behind an insert whose closures all went in with its step."""
+        return not ledgers.has_suspects and ledgers.looks % _LOOK_BACK_EVERY > 0
 
     def looks(
         self, solver: Callable[[], Solver], ledgers: ClosureLedger, new: Sequence[Closure]
@@ -92,7 +99,7 @@ class ClosureJudge:
         suspects that may be believed now; None: there are none.  Raises SolverError.
         """
         ledger = ledgers.of_kind[kind]
-        if not ledgers.counts()[SUSPECT]:
+        if not ledgers.has_suspects:
             return None
         new = ledger.unjudged()[:_TOGETHER]
         if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: len(ledger.closures)].any():
@@ -119,14 +126,10 @@ class ClosureJudge:
         if not tested.size:
             return None
         out = self.limits[ledger.dim].out
-        most_likely = residuals_weighed(solver, ledger, tested)
-        worst = np.flatnonzero(~(most_likely <= out))
+        worst = _worst(solver, ledger, tested, out)
         if not worst.size:
             return None
-        order = np.argsort(-np.nan_to_num(most_likely[worst], nan=np.inf), kind="stable")
-        worst = tested[worst[order[:_WORST]]]
-        numbers = closure_numbers(solver, ledger, worst)
-        ledger.bound[worst] = weights_without(numbers)
+        _bound_anew(solver, ledger, worst)
         d2 = residuals_weighed(solver, ledger, worst)
         if float(d2.max()) <= out:
             return None
@@ -139,7 +142,7 @@ class ClosureJudge:
 
     def _chosen(self, solver: Solver, ledger: Ledger, rows: I64, all_together: bool = False) -> Chosen:
         """Among rows."""
-        extent = self._extent(solver, ledger)
+        extent = self._extent(solver, ledger) if rows.size > 1 else 0.0  # which one by itself does not need
         return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds(), all_together)
 
     def _extent(self, solver: Solver, ledger: Ledger) -> float:
@@ -296,6 +299,29 @@ def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:
     now = closure_numbers(solver, ledger, rows, False)
     r = tangent_of(inverse_motion(now.z) @ inverse_motion(now.a) @ now.b)
     return np.einsum("na,nab,nb->n", r, ledger.bound[rows], r)
+
+
+def _worst(solver: Solver, ledger: Ledger, tested: I64, out: float) -> I64:
+    """The worst first of those whose d² is beyond `out` by their bounds."""
+    if ledger.dim == _PLANE_DIM:
+        found, distance, table = np.empty(_WORST, np.int64), np.empty(_WORST), solver._graph.array_table
+        return found[: list_worst(tested, ledger.ends, ledger.z, ledger.bound, table, out, found, distance)]
+    most_likely = residuals_weighed(solver, ledger, tested)
+    worst = np.flatnonzero(~(most_likely <= out))
+    order = np.argsort(-np.nan_to_num(most_likely[worst], nan=np.inf), kind="stable")
+    return tested[worst[order[:_WORST]]]
+
+
+def _bound_anew(solver: Solver, ledger: Ledger, rows: I64) -> None:
+    """The bounds of some closures that are in, by what the map is without each now."""
+    if ledger.dim == _PLANE_DIM:
+        table = solver._graph.array_table
+        free, places = np.empty(2 * rows.size, np.int64), np.empty((rows.size, 2), np.int64)
+        count = list_free_ends(rows, ledger.ends, table, free, places)
+        if (known := solver.covariances.try_joint(free[:count], _PLANE_DIM * count)) is not None:
+            bound_without(rows, ledger.ends, ledger.noise, places, known, table, ledger.bound)
+            return
+    ledger.bound[rows] = weights_without(closure_numbers(solver, ledger, rows))
 
 
 def closure_numbers(solver: Solver, ledger: Ledger, rows: I64, with_covariance: bool = True) -> ClosureNumbers:

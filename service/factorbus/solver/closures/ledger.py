@@ -14,6 +14,7 @@ from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.factor_graph import FactorGraph, with_room
 from factorbus.solver.graph.groups import FactorGroup, FactorsLike
+from factorbus.solver.kernels.closures.ahead import enter_judged
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.wording import counted
 
@@ -22,6 +23,7 @@ CLOSURE_STATES: tuple[str, ...] = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
 NEW, BY_USER, FAILED = "new", "user", "failed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 BELIEVED = {ACCEPTED, RESTORED}
+_ROOM = 256  # closures, from the first: to make more means new pages for ten columns
 _BURST = 10  # closures that one mistake brings
 _COLUMNS = ("z", "noise", "bound", "ends", "looked", "is_suspect", "is_new", "is_tested", "is_improbable", "is_rival")
 
@@ -37,7 +39,7 @@ class Closure:
 
     factor_id: int
     row: int
-    factor: FactorGroup
+    factor: FactorsLike
     came: int
     state: str = SUSPECT
     reason: str = NEW
@@ -141,12 +143,22 @@ class Ledger:
             self.accepted += closure.state == ACCEPTED
         self.closures += new
 
+    def enter_accepted(self, new: Sequence[Closure], ends: I64, looked: int, numbers: F64) -> None:
+        """The same of several that are all accepted, in rows which they know; numbers: of `judge_ahead`."""
+        n = len(self.closures)
+        self._make_room(n + len(new))
+        enter_judged(n, numbers, ends, self.z, self.noise, self.bound, self.ends)
+        self.looked[n : n + len(new)], self.is_tested[n : n + len(new)] = looked, True
+        self.accepted += len(new)
+        self.closures += new
+
     def _make_room(self, need: int) -> None:
         if need > len(self.z):
+            need = max(need, _ROOM)
             for name in _COLUMNS:
                 setattr(self, name, with_room(getattr(self, name), need))
 
-    def measure(self, closure: Closure, factor: FactorGroup) -> None:
+    def measure(self, closure: Closure, factor: FactorsLike) -> None:
         """What it measures, and how well."""
         closure.factor = factor
         self.z[closure.row] = motions_of_poses(factor.measured)[0]
@@ -211,7 +223,7 @@ class ClosureLedger:
         """How many are in each state."""
         return dict(self._counts)
 
-    def add(self, factor: FactorGroup, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
+    def add(self, factor: FactorsLike, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
         """A new one: a suspect that nobody has looked at."""
         closure = Closure(factor_id, 0, factor, revision, changed=revision)
         self.of_kind[factor.kind].add(closure, [graph.find(key) for key in closure.keys], self.looks)
@@ -228,6 +240,20 @@ class ClosureLedger:
         self.of_factor |= {closure.factor_id: closure for closure in new}
         for closure in new:
             self._counts[closure.state] += 1
+
+    def enter_accepted(self, kind: str, new: Sequence[Closure], ends: I64, numbers: F64) -> None:
+        """The same of several that are all accepted, in rows which they know; numbers: of `judge_ahead`."""
+        self.looks += 1
+        self.moved_at = self.looks
+        self.of_kind[kind].enter_accepted(new, ends, self.looks, numbers)
+        for closure in new:
+            self.of_factor[closure.factor_id] = closure
+        self._counts[ACCEPTED] += len(new)
+
+    @property
+    def has_suspects(self) -> bool:
+        """Whether any is one."""
+        return self._counts[SUSPECT] > 0
 
     def named(self, factors: Iterable[int]) -> list[Closure]:
         """Those with these ids.  Raises NotAClosure."""
@@ -355,7 +381,7 @@ def pick_rows(group: FactorsLike, chosen: np.ndarray | I64) -> FactorGroup:
     return FactorGroup(group.kind, *picked, group.loss, scale)
 
 
-def _noise(factor: FactorGroup, d: int) -> F64:
+def _noise(factor: FactorsLike, d: int) -> F64:
     """Ω⁻¹ in metres and radians: the residual of a rotation in space is half its angle."""
     omega = np.zeros((d, d))
     rows, columns = np.triu_indices(d)

@@ -12,7 +12,9 @@ _NO_TURN = 1e-9  # sine of an angle that has no axis any more
 def motions_of_poses(values: F64) -> F64:
     """Poses x y θ, or x y z qx qy qz qw, (n, 3 or 7), as matrices."""
     n, plane = len(values), values.shape[1] == 3
-    T = np.tile(np.eye(3 if plane else 4), (n, 1, 1))
+    size = 3 if plane else 4
+    T = np.zeros((n, size, size))
+    T[:, np.arange(size), np.arange(size)] = 1.0
     if plane:
         c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
         T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c

@@ -15,7 +15,7 @@ from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.closures.ledger import BELIEVED, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.divergence import copied
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.groups import FactorGroup
+from factorbus.solver.graph.groups import FactorsLike
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.solver import Solver
 
@@ -32,7 +32,7 @@ class ClosureSwitch(NamedTuple):
         return [FactorsRemoved(np.array([c.factor_id for c in self.out]))] if self.out else []
 
     @property
-    def additions(self) -> list[FactorGroup]:
+    def additions(self) -> list[FactorsLike]:
         """What comes."""
         return [c.factor for c in self.into]
 

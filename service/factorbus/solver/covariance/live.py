@@ -3,6 +3,7 @@
 import numpy as np
 
 from factorbus.solver.bayes_tree.tree import CliqueTree
+from factorbus.solver.covariance.kernels.foreseen import foresee_closures
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.square_root import DIMS
 from factorbus.solver.graph.factor_graph import FactorGraph
@@ -16,12 +17,16 @@ class Live:
     def __init__(self, graph: FactorGraph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
 
-    def joint(self, variables: I64) -> F64:
-        """(d, d): of different free variables together, in their order."""
-        tree, var = self._tree, self._graph.var
-        size = 0
-        for v in variables.tolist():
-            size += int(DIMS[var[v, at.V_KIND]])
+    def foresee(self, v0: int, f0: int, closing: I64, ends: I64, out: F64) -> int:
+        """See `foresee_closures`."""
+        tables = self._graph.array_table, self._tree.array_table
+        return foresee_closures(v0, f0, closing, *tables, DIMS, ends, out)
+
+    def joint(self, variables: I64, scalars: int | None = None) -> F64:
+        """(d, d): of different free variables together, in their order; scalars: d, where that is known."""
+        tree, var, size = self._tree, self._graph.var, scalars
+        if size is None:
+            size = sum(int(DIMS[var[v, at.V_KIND]]) for v in variables.tolist())
         out = np.empty((size, size))
         joint_block(variables, var, DIMS, tree.array_table, out)
         return out

@@ -50,9 +50,16 @@ class CovarianceSource:
         """What keeps all diagonal blocks of the covariance up, updated after every step.  None: as for `try_view`."""
         return Upkeep(self._graph, self._tree) if self._tree else None
 
-    def try_joint(self, variables: I64) -> F64 | None:
+    def try_foresee(self, v0: int, f0: int, closing: I64, ends: I64, out: F64) -> bool:
+        """Judge loop closures before their step, as `kernels.closures.ahead` does; False: that cannot be done.
+
+        v0, f0: variables and factors that the last step had.  closing: rows of factors.  ends, out: what is found.
+        """
+        return self._live is not None and self._live.foresee(v0, f0, closing, ends, out) >= 0
+
+    def try_joint(self, variables: I64, scalars: int | None = None) -> F64 | None:
         """The joint covariance of a few different free variables (by index) as of the last step, read from R in place.
 
-        None: as for `try_view`.
+        scalars: of all of them, where that is known.  None: as for `try_view`.
         """
-        return self._live.joint(variables) if self._live else None
+        return self._live.joint(variables, scalars) if self._live else None

@@ -67,11 +67,11 @@ class Group(NamedTuple):
     stamps: I64 | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FactorGroup:
+class FactorGroup(NamedTuple):
     """Factors of one kind with one loss, in the order of their ids.
 
     keys (m, arity), measured (m, size), information (m, triangle); with a loss its scale (m,).  ids (m,), ascending.
+    A named tuple as `Group` is: each loop closure that a map tests has one.
     """
 
     kind: str

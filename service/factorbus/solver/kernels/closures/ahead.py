@@ -27,7 +27,8 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import graph_at
 
 MOVED = 13  # numbers of an end: T as x, y, cosine, sine, and Q
-END_BASE, END_PLACE = range(2)  # columns of `ends`: u, and where it is among the free ones; −1: it is fixed
+# Columns of `ends`: u, and where it is among the free ones, −1 where it is fixed; and the end itself.
+END_BASE, END_PLACE, END_ITSELF, END_COLUMNS = range(4)
 J_DISTANCE, J_ALLOWED, J_NOISE, J_WEIGHT, J_BOUND, J_MEASURED, J_SIZE = 0, 1, 4, 7, 10, 13, 16  # rows of a judgement
 
 
@@ -36,7 +37,8 @@ def list_closure_ends(v0: int, f0: int, closing: I64, graph_table: I64, free: I6
     """Where the ends of closures lead back to; gives how many free poses those are, −1: it is not by odometry alone.
 
     in   v0, f0: variables and factors that the last step had  closing (n,): rows of factors, ascending
-    out  free: poses, each once  ends (2 n, 2)  moved (2 n, MOVED): of first and second end, one after the other
+    out  free: poses, each once
+         ends (2 n, END_COLUMNS), moved (2 n, MOVED): of first and second end, one after the other
     """
     graph = graph_at(graph_table)
     var, fac, payload, counts = graph.var, graph.fac, graph.payload, graph.counts
@@ -61,6 +63,7 @@ def list_closure_ends(v0: int, f0: int, closing: I64, graph_table: I64, free: I6
     count = 0
     for e in range(2 * closing.size):
         v, own = fac[closing[e // 2], at.F_I + e % 2], new
+        ends[e, END_ITSELF] = v
         if v >= v0:
             if e % 2 == 1 and fac[closing[e // 2], at.F_I] >= v0:
                 return -1  # both are new: what odometry adds to them is not independent
@@ -150,20 +153,41 @@ def judge_ahead(closing: I64, graph_table: I64, ends: I64, moved: F64, known: F6
         add_predicted(own[J_WEIGHT : J_WEIGHT + 3], 0, 0, 0, 0, own[J_ALLOWED : J_ALLOWED + 3], own[J_BOUND:])
 
 
+@kernel(
+    "void(int64, float64[:,:,::1], int64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], int64[:,::1])"
+)
+def enter_judged(first: int, judged: F64, of: I64, z: F64, noise: F64, bound: F64, ends: I64) -> None:
+    """Write closures into the columns of a ledger, from row `first` on.
+
+    in   judged, of: `out` of `judge_ahead`, and its `ends`
+    out  the columns: what was measured, Ω⁻¹, bounds, ends
+    """
+    for k in range(len(judged)):
+        n = first + k
+        for r in range(3):
+            for c in range(3):
+                z[n, r, c], noise[n, r, c] = judged[k, J_MEASURED + r, c], judged[k, J_NOISE + r, c]
+                bound[n, r, c] = judged[k, J_BOUND + r, c]
+        ends[n, 0], ends[n, 1] = of[2 * k, END_ITSELF], of[2 * k + 1, END_ITSELF]
+
+
 @kernel("void(int64[::1], int64[:,::1], float64[:,:,::1], float64[:,:,::1], int64[::1], float64[::1])")
 def weigh_residuals(rows: I64, ends: I64, z: F64, weights: F64, graph_table: I64, out: F64) -> None:
     """rᵀ W r of some closures at the estimate, of the columns of a ledger."""
     graph = graph_at(graph_table)
     var, values = graph.var, graph.values
     for k in range(rows.size):
-        n = rows[k]
-        a, b = pose_of(values, var[ends[n, 0], at.V_AT]), pose_of(values, var[ends[n, 1], at.V_AT])
-        x, y, c, s = motion_to(motion_at(z[n]), motion_to(a, b))
-        W, t = weights[n], math.atan2(s, c)
-        out[k] = (
-            x * x * W[0, 0] + y * y * W[1, 1] + t * t * W[2, 2]
-            + 2.0 * (x * y * W[0, 1] + x * t * W[0, 2] + y * t * W[1, 2])
-        )  # fmt: skip
+        out[k] = residual_weighed(rows[k], ends, z, weights, var, values)
+
+
+@inline_kernel
+def residual_weighed(n: int, ends: I64, z: F64, weights: F64, var: I64, values: F64) -> float:
+    """rᵀ W r of closure n."""
+    a, b = pose_of(values, var[ends[n, 0], at.V_AT]), pose_of(values, var[ends[n, 1], at.V_AT])
+    x, y, c, s = motion_to(motion_at(z[n]), motion_to(a, b))
+    W, t = weights[n], math.atan2(s, c)
+    squares = x * x * W[0, 0] + y * y * W[1, 1] + t * t * W[2, 2]
+    return squares + 2.0 * (x * y * W[0, 1] + x * t * W[0, 2] + y * t * W[1, 2])
 
 
 @kernel("int64(int64[::1], int64[::1], int64[:,::1], float64[:,:,::1], int64[::1], float64, float64, int64[::1])")

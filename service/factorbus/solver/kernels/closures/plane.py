@@ -55,19 +55,25 @@ def weights_without_plane(a: F64, b: F64, noise: F64, known: F64, out: F64) -> N
         P[:, :] = 0.0
         for m in range(4):
             add_predicted(J, 3 * (m // 2), 6 * k + 3 * (m // 2), 3 * (m % 2), 6 * k + 3 * (m % 2), known, P)
-        cholesky_plane(noise[k], 0.0, L)
-        solve_plane(L, P)  # P := L⁻¹ P L⁻ᵀ, which is symmetric
-        transpose_plane(P)
-        solve_plane(L, P)
-        for r in range(3):
-            for c in range(3):
-                P[r, c], B[r, c] = (1.0 if r == c else 0.0) - P[r, c], 1.0 if r == c else 0.0
-        cholesky_plane(P, HELD, K)
-        solve_plane(L, B)
-        solve_plane(K, B)
-        for r in range(3):
-            for c in range(3):
-                out[k, r, c] = B[0, r] * B[0, c] + B[1, r] * B[1, c] + B[2, r] * B[2, c]
+        put_weight_without(P, noise[k], L, K, B, out[k])
+
+
+@inline_kernel
+def put_weight_without(P: F64, N: F64, L: F64, K: F64, B: F64, out: F64) -> None:
+    """(N − P)⁻¹, as above.  Overwrites P; L and K, with zeros above their diagonals, and B (3, 3) are for scratch."""
+    cholesky_plane(N, 0.0, L)
+    solve_plane(L, P)  # P := L⁻¹ P L⁻ᵀ, which is symmetric
+    transpose_plane(P)
+    solve_plane(L, P)
+    for r in range(3):
+        for c in range(3):
+            P[r, c], B[r, c] = (1.0 if r == c else 0.0) - P[r, c], 1.0 if r == c else 0.0
+    cholesky_plane(P, HELD, K)
+    solve_plane(L, B)
+    solve_plane(K, B)
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = B[0, r] * B[0, c] + B[1, r] * B[1, c] + B[2, r] * B[2, c]
 
 
 @inline_kernel
