@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,11 @@ from processes import processes
 
 from factorbus.client import Draft, Map, Problem, Unavailable, aio, connect
 from factorbus.client.geodesic import length_of_way
+from factorbus.client.key_numbers import key_number
 from factorbus.client.smoothed_poses import SmoothedPoses
+from factorbus.proto.messages import Delta
+from factorbus.proto.problems import NotHeld
+from factorbus.proto.symbols import symbol
 
 pytestmark = pytest.mark.timeout(300)  # the first service on a machine compiles its kernels
 
@@ -143,6 +148,64 @@ def test_a_map_made_anew_is_no_correction(endpoint: str, joined: Map) -> None:
             while joined.estimate.epoch != other.epoch or "x1" not in joined.estimate:
                 joined.estimate.wait_for(joined.estimate.revision + 1)
             assert_array_equal(joined.pose("x1", smooth_s=1e6).pose, [7.0, 7.0, 0.0])
+
+
+class HeldMirror:
+    """What the poses want of a mirror, without a bus."""
+
+    def __init__(self) -> None:
+        self.epoch, self.values = 1, {symbol("x", 1): np.zeros(3)}
+        self.tell: Any = None
+
+    def on_delta(self, callback: Any) -> None:
+        self.tell = callback
+
+    def find(self, key: str | int) -> tuple[str, np.ndarray]:
+        number = key_number(key)
+        if number not in self.values:
+            raise NotHeld("it is not here")
+        return "se2", self.values[number]
+
+    def whole(self, values: dict[int, np.ndarray], epoch: int = 1) -> None:
+        self.epoch, self.values = epoch, values
+        self.tell(Delta(epoch, 1, 0, ()))
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_value_of_another_epoch_is_no_correction(told: bool) -> None:
+    """Also where one asks after the map has come and before its delta is told."""
+    mirror = HeldMirror()
+    poses = SmoothedPoses(mirror, Clock())  # type: ignore[arg-type]
+    poses.pose("x1", 1.0)
+    there = {symbol("x", 1): np.array([7.0, 7.0, 0.0])}
+    if told:
+        mirror.whole(there, epoch=2)
+    else:
+        mirror.epoch, mirror.values = 2, there
+    given = poses.pose("x1", 1.0)
+    assert given.left_s == 0.0
+    assert_array_equal(given.pose, [7.0, 7.0, 0.0])
+
+
+def test_a_pose_that_went_and_came_again_is_another() -> None:
+    mirror = HeldMirror()
+    poses = SmoothedPoses(mirror, Clock())  # type: ignore[arg-type]
+    first = mirror.values
+    poses.pose("x1", 1.0)
+    mirror.whole({})
+    mirror.whole({each: value + 1.0 for each, value in first.items()})
+    assert_array_equal(poses.pose("x1", 1.0).pose, [1.0, 1.0, 1.0])
+
+
+def test_of_many_poses_the_last_ones_asked_for_are_followed() -> None:
+    mirror = HeldMirror()
+    poses = SmoothedPoses(mirror, Clock())  # type: ignore[arg-type]
+    mirror.values = {symbol("x", n): np.zeros(3) for n in range(1025)}
+    for n in range(1025):
+        poses.pose(symbol("x", n), 1.0)
+    mirror.whole({each: np.ones(3) for each in mirror.values})
+    assert_array_equal(poses.pose("x1024", 1.0).pose, np.zeros(3))
+    assert_array_equal(poses.pose("x0", 1.0).pose, np.ones(3))
 
 
 @pytest.mark.parametrize("smooth_s", [-1.0, math.nan, math.inf, "1", None, True, [1.0], 10**400])
