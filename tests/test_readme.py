@@ -41,17 +41,20 @@ def test_the_rest_of_the_readme(tmp_path: Path) -> None:
 
 def test_the_client_librarys_guide(tmp_path: Path) -> None:
     programs = [block for block in blocks("clients/README.md") if block[0] == "python"]
-    assert len(programs) == 7
+    assert len(programs) == 8
     with walker(tmp_path) as run:
         run("bash", "factorbus serve")
         run(*programs[0])
         said = [run(*program) for program in programs]
     assert "unknown_variable" in said[3]
     assert said[4].rstrip().endswith("False")
-    stamp, *trajectory = re.findall(r"\d{19}|\d{10}\.\d{9}", said[5])
+    pose, raw = re.findall(r"\[[^]]+\]", said[5])
+    assert pose == raw
+    assert said[5].endswith("] 0.0\n")
+    stamp, *trajectory = re.findall(r"\d{19}|\d{10}\.\d{9}", said[6])
     assert [line.replace(".", "") for line in trajectory[-2:]] == trajectory[:2]
     assert stamp == trajectory[1]
-    assert said[6] == "2\n[1. 0. 0.]\n"
+    assert said[7] == "2\n[1. 0. 0.]\n"
 
 
 def test_the_filter_front_end_of_the_workers_guide(tmp_path: Path) -> None:

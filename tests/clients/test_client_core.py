@@ -167,11 +167,11 @@ def test_a_gap_is_noticed_and_mended_by_the_estimate_and_what_came_meanwhile() -
     assert following.delta(Delta(7, 5, 4, column([1], 5.0))) == []
     assert not following.live
     assert following.delta(Delta(7, 6, 5, column([3], 6.0))) == []
-    assert following.values.value(1).tolist() == [0, 1]  # the old value stays readable
+    assert following.values.find(1)[1].tolist() == [0, 1]  # the old value stays readable
     news = follow(following, Estimate(7, 5, column([1, 2], 5.0)))
     assert [(delta.previous, delta.revision) for delta in news] == [(0, 5), (5, 6)]
     assert (following.live, following.revision) == (True, 6)
-    assert following.values.value(3).tolist() == [6, 3]
+    assert following.values.find(3)[1].tolist() == [6, 3]
 
 
 def test_an_estimate_older_than_the_gap_is_not_enough() -> None:
@@ -191,7 +191,7 @@ def test_what_is_older_than_we_are_changes_nothing() -> None:
     following.lost()
     assert follow(following, Estimate(7, 5, column([1], 9.0))) == []
     assert not following.live
-    assert following.values.value(1).tolist() == [0, 1]
+    assert following.values.find(1)[1].tolist() == [0, 1]
 
 
 def test_another_epoch_starts_over() -> None:

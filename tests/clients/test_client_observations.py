@@ -59,7 +59,7 @@ def test_a_delta_of_everything_lets_go_of_what_there_was() -> None:
     assert following.delta(whole) == [whole]
     assert (following.live, following.revision, following.values.count()) == (True, 4, 1)
     assert following.values.columns_of("idp") is None
-    np.testing.assert_array_equal(following.values.value(KEY), [1, 2, 3])
+    np.testing.assert_array_equal(following.values.find(KEY)[1], [1, 2, 3])
     assert following.delta(whole) == [], "it has been seen"
     after = Delta(7, 5, 4, (point,))
     assert following.delta(after) == [after]

@@ -91,7 +91,7 @@ def test_odometry_that_begins_anew_is_joined_by_what_is_not_known() -> None:
     values[symbol("x", 21)] = np.array([20.0, 0.0, 0.0])
     correction = made.try_correction(values.get)
     assert correction is not None
-    assert correction.t[0] == pytest.approx(20.0), "the robot is where it was"
+    assert correction.T_map_odom.t[0] == pytest.approx(20.0), "the robot is where it was"
 
 
 def test_after_a_refusal_at_a_new_beginning_it_hangs_on_the_keyframe_before() -> None:

@@ -47,7 +47,7 @@ def test_a_recording_with_a_front_end_and_gnss_is_replayed_as_it_says(
 
 def test_its_commands_run(spawn: Callable[..., Process]) -> None:
     """The robot's router is another service here: any Zenoh hub is one."""
-    serve, join, more, *_ = BLOCKS
+    serve, join, more, *_, smooth = BLOCKS
     assert serve[-2:] == ["--listen", "tcp/127.0.0.1:7448"]
     assert join[2:] == ["--connect", "tcp/127.0.0.1:7448", "--ros", "tcp/127.0.0.1:7447"]
     ours, theirs = (spawn("-m", "factorbus.cli", *serve[:-1], "tcp/127.0.0.1:0", "--no-warm") for _ in range(2))
@@ -58,6 +58,11 @@ def test_its_commands_run(spawn: Callable[..., Process]) -> None:
     assert with_graph.ready() == [router]
     with_graph.signal(signal.SIGINT)
     assert with_graph.wait() == 0
+    smoothed = spawn("-m", "factorbus.cli", *smooth[:3], at, "--ros", router, "--domain", "2", *smooth[6:])
+    assert smooth[6:] == ["--smooth-s", "2"]
+    assert smoothed.ready() == [router]
+    smoothed.signal(signal.SIGINT)
+    assert smoothed.wait() == 0
     with ros.session(router) as bus:
         tokens = ros.RosNode(bus, 0).wait_for_endpoints(8)
         assert any(token.endswith("/NN/%/%/factorbus") for token in tokens)

@@ -198,8 +198,8 @@ def test_mounts_that_cannot_be_are_wrong_use(mount: str, capsys: pytest.CaptureF
 def test_options_arrive() -> None:
     options = BridgeOptions(
         odom="/o", poses=(), landmarks=("/a", "/b"), map_frame="map", space=True, letter="a", start="pose",
-        keyframe=(1.0, 2.0), mounts=("c=1,2,3,0,0,0,1",), drift=(0.1, 0.2), tf="/tf", path="/p",
-        markers="/m", pose_out="/c", tolerance=0.5, display=2.0, imu="/i", imu_noise=(1.0, 2.0, 3.0, 4.0),
+        keyframe=(1.0, 2.0), mounts=("c=1,2,3,0,0,0,1",), drift=(0.1, 0.2), tf="/tf", tf_raw="/r", path="/p",
+        markers="/m", pose_out="/c", tolerance=0.5, smooth_s=3.0, display=2.0, imu="/i", imu_noise=(1.0, 2.0, 3.0, 4.0),
     )  # fmt: skip
     made = bridge_settings(options)
     assert (made.poses, made.landmarks, made.space, made.floors.turn_rad) == (
@@ -209,6 +209,7 @@ def test_options_arrive() -> None:
         0.2,
     )
     np.testing.assert_array_equal(made.mounts["c"].t, from_quaternion((1, 2, 3), (0, 0, 0, 1)).t)
+    assert (made.smooth_s, made.raw_transforms) == (3.0, "/r")
     assert (made.pose, made.imu, made.imu_noise.accelerometer_walk) == ("/c", "/i", 4.0)
     with pytest.raises(BadRosName, match="velocities, biases or gravity"):
         bridge_settings(replace(options, letter="B"))

@@ -22,6 +22,7 @@ from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
 from factorbus.client.preintegration import PreintegratedImu, preintegrate_samples
 from factorbus.client.renaming_kinds import rename_kinds
+from factorbus.client.smoothed_poses import BlendedPose
 from factorbus.client.snapshot import Snapshot
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.interest import Interest
@@ -32,6 +33,7 @@ __all__ = [
     "Alignment",
     "AmbiguousAlignment",
     "BadCamera",
+    "BlendedPose",
     "Bus",
     "Camera",
     "CannotMerge",

@@ -34,6 +34,7 @@ from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
 from factorbus.client.questions import logged
 from factorbus.client.renaming_kinds import saying_how_to_rename
+from factorbus.client.smoothed_poses import BlendedPose
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.asking import Repaired
 from factorbus.proto.camera import Camera
@@ -161,6 +162,10 @@ class Map:
     def estimate(self) -> Mirror:
         """The live estimate; reading it never waits.  Raises Unavailable for a map opened with mirror=False."""
         return self._map.estimate
+
+    def pose(self, key: Key, smooth_s: float = 0.0) -> BlendedPose:
+        """The pose of a variable with corrections blended, as `factorbus.client.Map.pose`; it never waits."""
+        return self._map.pose(key, smooth_s)
 
     async def insert(
         self,

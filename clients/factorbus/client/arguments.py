@@ -35,10 +35,12 @@ def checked_seconds(what: str, given: Any, usual: float) -> float:
     """How long to wait; None: as long as usual.  Raises BadOption."""
     if given is None:
         return usual
-    number = math.nan if isinstance(given, (bool, np.bool_)) or not isinstance(given, Real) else float(given)
-    if not 0.0 <= number <= threading.TIMEOUT_MAX:
-        raise BadOption(what, seen(given), "seconds: a finite number, 0 or more; or None, for as long as usual")
-    return number
+    return _seconds(what, given, "seconds: a finite number, 0 or more; or None, for as long as usual")
+
+
+def checked_duration(what: str, given: Any) -> float:
+    """How long something takes, in seconds.  Raises BadOption."""
+    return _seconds(what, given, "seconds: a finite number, 0 or more")
 
 
 def as_numbers(what: str, given: Any, wanted: str = "numbers") -> F64:
@@ -81,6 +83,16 @@ def checked_keywords(what: str, given: Iterable[str], wanted: Sequence[str]) -> 
     for name in given:
         if name not in wanted:
             raise BadOption(what, f"there is no keyword {name!r}", f"{', '.join(wanted)}{nearest(name, wanted)}")
+
+
+def _seconds(what: str, given: Any, wanted: str) -> float:
+    try:
+        number = math.nan if isinstance(given, (bool, np.bool_)) or not isinstance(given, Real) else float(given)
+    except OverflowError:  # a whole number beyond all floats
+        number = math.inf
+    if not 0.0 <= number <= threading.TIMEOUT_MAX:
+        raise BadOption(what, seen(given), wanted)
+    return number
 
 
 def _first_not_finite(numbers: F64) -> str:

@@ -45,11 +45,11 @@ class HeldValues:
             groups.append(Variables(kind, *table.columns(), stamps=stamps if (stamps != NO_STAMP).any() else None))
         return tuple(groups)
 
-    def value(self, key: int) -> F64 | None:
-        """A copy of one variable's value."""
-        for table in self._tables.values():
+    def find(self, key: int) -> tuple[str, F64] | None:
+        """The kind of one variable, and a copy of its value."""
+        for kind, table in self._tables.items():
             if (value := table.get(key)) is not None:
-                return value
+                return kind, value
         return None
 
     def stamp(self, key: int) -> int | None:

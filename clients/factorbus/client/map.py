@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from queue import SimpleQueue
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -21,10 +20,12 @@ from factorbus.client.link import Link
 from factorbus.client.map_row import MapRow
 from factorbus.client.merging import Merged, as_trusted, fit_into
 from factorbus.client.mirror import Mirror
-from factorbus.client.pending_insert import PendingInsert
+from factorbus.client.pending_insert import PendingInsert, encoded
+from factorbus.client.present_clients import present_clients
 from factorbus.client.questions import Questions, logged
 from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.request_sender import Request, RequestSender
+from factorbus.client.smoothed_poses import BlendedPose, SmoothedPoses
 from factorbus.client.supported import check_changes, check_interest, check_stamps, check_suspects, check_trusted
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
@@ -32,9 +33,8 @@ from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
 from factorbus.proto.closures import Suspects
 from factorbus.proto.interest import Interest
-from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Insert, MapGraph
-from factorbus.proto.problems import ClosedHere, NoMirror, Problem, Refused, TooLarge, Unavailable
+from factorbus.proto.problems import ClosedHere, NoMirror, Problem, Refused, Unavailable
 from factorbus.wording import counted
 
 SUFFIX_LENGTH = 9  # characters that joining a map adds to the name of a client
@@ -63,6 +63,7 @@ class Map:
         self._size, self._join = window, join
         self._stack, self._presence = ExitStack(), ExitStack()
         self._mirror: Mirror | None = None
+        self._poses: SmoothedPoses | None = None
         self._lock = threading.RLock()  # entered itself, and not by its condition: see `interruptible_future.py`
         self._changed = threading.Condition(self._lock)
         self._sending = threading.Lock()
@@ -93,6 +94,12 @@ class Map:
         if self._mirror is None:
             raise NoMirror(self.name)
         return self._mirror
+
+    def pose(self, key: Key, smooth_s: float = 0.0) -> BlendedPose:
+        """A pose of the live estimate, raw and with corrections blended over a time.  Raises NotHeld, BadOption."""
+        with self._lock:
+            poses = self._poses = self._poses or SmoothedPoses(self.estimate)
+        return poses.pose(key, smooth_s)
 
     def insert(
         self,
@@ -283,11 +290,7 @@ class Map:
 
     def clients(self, timeout_s: float | None = None) -> set[str]:
         """Names of the clients that have joined the map and not left it, of those that tell; this one is among them."""
-        self._link.check_open(f"map {self.name!r}, asked for its clients")
-        came: SimpleQueue[set[str]] = SimpleQueue()
-        timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
-        self._link.ask_tokens(keys.any_client_token(self.name), timeout_s, came.put)
-        return set(map(keys.client_of, came.get()))
+        return present_clients(self._link, self.name, checked_seconds("timeout_s", timeout_s, self.timeout_s))
 
     def export(
         self,
@@ -364,10 +367,8 @@ class Map:
             wanted = refused.detail.get("next")
             return refused.code == "bad_sequence" and type(wanted) is int and window.waits_for(insert.sequence, wanted)
 
-        payload = codec.encode_insert(insert)
-        if len(payload) > REQUEST_LIMITS.max_bytes:  # the bus would drop it without a word
-            raise TooLarge("the insert", len(payload), REQUEST_LIMITS.max_bytes, "bytes")
-        request = Request(f"map {self.name!r}", self._key, payload, codec.decode_accepted, passing=passing, then=then)
+        sent, read = encoded(insert), codec.decode_accepted
+        request = Request(f"map {self.name!r}", self._key, sent, read, passing=passing, then=then)
         return PendingInsert(request, insert.sequence, timeout_s)
 
     def _catch_up(self, timeout_s: float) -> None:

@@ -67,15 +67,7 @@ class Mirror:
 
     def __getitem__(self, key: str | int) -> F64:
         """The value of a variable, "x12" or its number: a copy.  Raises NotHeld, a KeyError."""
-        try:
-            number = key_number(key)
-        except BadSymbol as bad:
-            raise NotHeld(bad.message) from None
-        with self._lock:
-            value = self._following.values.value(number)
-        if value is None:
-            raise NotHeld(f"{format_symbol(number)} is not in map {self._map!r} at revision {self.revision}")
-        return value
+        return self.find(key)[1]
 
     def __contains__(self, key: str | int) -> bool:
         try:
@@ -127,6 +119,18 @@ class Mirror:
     def received_bytes(self) -> int:
         """Bytes of the messages and answers that have come to keep these values."""
         return self._received
+
+    def find(self, key: str | int) -> tuple[str, F64]:
+        """The kind of a variable, "x12" or its number, and its value: a copy.  Raises NotHeld, a KeyError."""
+        try:
+            number = key_number(key)
+        except BadSymbol as bad:
+            raise NotHeld(bad.message) from None
+        with self._lock:
+            found = self._following.values.find(number)
+        if found is None:
+            raise NotHeld(f"{format_symbol(number)} is not in map {self._map!r} at revision {self.revision}")
+        return found
 
     def stamp(self, key: str | int) -> int | None:
         """When a variable was, "x12" or its number: the nanoseconds that it came with, or None.  Raises NotHeld."""
@@ -233,12 +237,8 @@ class Mirror:
         return self._following.live and self._following.revision >= revision
 
     @property
-    def _is_latest(self) -> bool:
-        return self._there(self._expected)
-
-    @property
     def _is_at_rest(self) -> bool:
-        return self._is_latest and self.converging is False
+        return self._there(self._expected) and self.converging is False
 
     def _check_open(self) -> None:
         if self._closing:

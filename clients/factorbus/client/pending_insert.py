@@ -4,8 +4,10 @@ from concurrent.futures import Future
 
 from factorbus.client.arguments import checked_seconds
 from factorbus.client.request_sender import Request
-from factorbus.proto.messages import Accepted
-from factorbus.proto.problems import Unavailable
+from factorbus.proto.codec import encode_insert
+from factorbus.proto.limits import REQUEST_LIMITS
+from factorbus.proto.messages import Accepted, Insert
+from factorbus.proto.problems import TooLarge, Unavailable
 
 
 class PendingInsert:
@@ -44,6 +46,14 @@ class PendingInsert:
         except TimeoutError:
             self.seen = False
             raise NoAnswerYet(self, timeout_s) from None
+
+
+def encoded(insert: Insert) -> bytes:
+    """An insert as it is sent.  Raises TooLarge: the bus would drop it without a word."""
+    payload = encode_insert(insert)
+    if len(payload) > REQUEST_LIMITS.max_bytes:
+        raise TooLarge("the insert", len(payload), REQUEST_LIMITS.max_bytes, "bytes")
+    return payload
 
 
 class NoAnswerYet(Unavailable):

@@ -15,12 +15,14 @@ from factorbus.proto.messages import Delta
 from factorbus.proto.symbols import symbol
 from factorbus.ros2 import display
 from factorbus.ros2.front_end import FrontEnd
+from factorbus.ros2.geometry import Transform
 from factorbus.ros2.inertial import first_of_letter
 from factorbus.ros2.messages import LATEST_S, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
 from factorbus.ros2.names import Topic
-from factorbus.ros2.node import Node
+from factorbus.ros2.node import Node, Publisher
 from factorbus.ros2.problems import BadRosMessage, Unusable
 from factorbus.ros2.settings import FRAME_LETTER, GRAVITY_LETTER, STATIC, Settings
+from factorbus.ros2.smoothing import SmoothedCorrection
 from factorbus.ros2.space import SPACES
 
 log = logging.getLogger("factorbus.ros2")
@@ -47,7 +49,12 @@ class Bridge:
         self._told: Counter[tuple[str, str]] = Counter()
         self._remarked: set[tuple[str, str]] = set()
         self._front_end = FrontEnd(settings, *self._place_in_map())
+        self._smoothed = SmoothedCorrection(settings.smooth_s)
+        self._correcting = threading.Lock()  # of two threads none publishes by an older estimate than the other
         self._transforms = node.publisher(self._topic(settings.transforms, TRANSFORMS, 100))
+        self._raw_transforms = (
+            node.publisher(self._topic(settings.raw_transforms, TRANSFORMS, 100)) if settings.smooth_s else None
+        )
         self._path = node.publisher(self._topic(settings.path, PATH, 1))
         self._markers = node.publisher(self._topic(settings.markers, MARKERS, 1))
         self._pose = node.publisher(self._topic(settings.pose, POSE, 1))
@@ -178,7 +185,9 @@ class Bridge:
         if refused.code in _OTHER_MAP:
             self._map.rejoin()
             self._map.estimate.wait_for(0)
-            self._front_end.begin_again(*self._place_in_map())
+            with self._correcting:
+                self._front_end.begin_again(*self._place_in_map())
+                self._smoothed.forget()
         else:
             self._front_end.rewind(lambda key: key in self._map.estimate)
 
@@ -195,12 +204,19 @@ class Bridge:
             except KeyError:
                 return None
 
-        T_map_odom = self._front_end.try_correction(value_of)
-        if T_map_odom is not None:
-            stamp_ns = min(self._front_end.stamp_ns + self._tolerance_ns, LATEST_S * 10**9)
-            frame = self._front_end.odometry_frame
-            self._transforms.publish(display.transform(self._messages, self._settings, frame, T_map_odom, stamp_ns))
+        with self._correcting:
+            correction, last_ns = self._front_end.try_correction(value_of), self._front_end.stamp_ns
+            if correction is None:
+                return
+            stamp_ns = min(last_ns + self._tolerance_ns, LATEST_S * 10**9)
+            self._publish_transform(self._transforms, self._smoothed.at(correction, last_ns), stamp_ns)
+            if self._raw_transforms is not None:
+                self._publish_transform(self._raw_transforms, correction.T_map_odom, stamp_ns)
             self.counts["transforms"] += 1
+
+    def _publish_transform(self, to: Publisher, T_map_odom: Transform, stamp_ns: int) -> None:
+        frame = self._front_end.odometry_frame
+        to.publish(display.transform(self._messages, self._settings, frame, T_map_odom, stamp_ns))
 
     def _draw(self, stop: threading.Event) -> None:
         """Path and markers whenever the estimate has changed, as often as may be."""

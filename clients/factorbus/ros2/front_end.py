@@ -30,7 +30,7 @@ from factorbus.ros2.odometry import OdometryReader
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
-from factorbus.ros2.track import KeyframePlace, OdometryTrack, Sample
+from factorbus.ros2.track import Correction, KeyframePlace, OdometryTrack, Sample
 
 _WAITING = 256
 _STILL = 1e-12  # metres and radians: no way at all
@@ -110,11 +110,12 @@ class FrontEnd:
         """Nothing goes into the map before a pose is received."""
         return self._wait_for_pose and self._track.keyframe is None
 
-    def try_correction(self, value_of: Callable[[int], F64 | None]) -> Transform | None:
-        """T_map_odom by the newest keyframe that has a value, if there is one."""
+    def try_correction(self, value_of: Callable[[int], F64 | None]) -> Correction | None:
+        """By the newest keyframe that has a value, if there is one."""
         for keyframe in reversed(self._track.keyframes):
             if (row := value_of(keyframe.key)) is not None:
-                return self._space.transform(row) @ keyframe.T_odom_base.inverse()
+                T_map_odom = self._space.transform(row) @ keyframe.T_odom_base.inverse()
+                return Correction(T_map_odom, keyframe.T_first_odom)
         return None
 
     def open_ends(self) -> Iterator[tuple[str, str]]:

@@ -43,12 +43,14 @@ class RobotOptions:
 class BridgeOptions(RobotOptions):
     """Those of `factorbus ros2`, and what it publishes.
 
-    tf, path, markers, pose_out: topics.  tolerance, display: seconds.
+    tf, tf_raw, path, markers, pose_out: topics.  tolerance, smooth_s, display: seconds.
     """
 
     tf: str
+    tf_raw: str
     path: str
     markers: str
     pose_out: str
     tolerance: float
+    smooth_s: float
     display: float

@@ -46,6 +46,7 @@ class Settings:
     start: "odometry": the map begins where odometry does; "pose": with the first pose that is received.
     keyframe_m, keyframe_rad: a keyframe when that far or that much turned since the last.
     mounts: frame of a sensor to T_base_sensor.  tolerance_s: by how much transforms are stamped ahead.
+    smooth_s: over how long a correction of transforms is blended; with it raw_transforms has them as they are.
     display_s: least time between paths.  fix_sigma_m: of fixes that do not say how good they are.
     robot_id: which robot of pose graphs this one is; None: the first that is heard.
     rotation_first: the covariances of pose graphs have rotation before translation, as GTSAM's.
@@ -63,6 +64,7 @@ class Settings:
     markers: str = "/factorbus/markers"
     pose: str = "/factorbus/pose"
     transforms: str = "/tf"
+    raw_transforms: str = "/factorbus/tf_raw"
     map_frame: str = "map"
     space: str = "plane"
     letter: str = "x"
@@ -71,6 +73,7 @@ class Settings:
     keyframe_m: float = 0.5
     keyframe_rad: float = 0.35
     tolerance_s: float = 0.1
+    smooth_s: float = 0.0
     display_s: float = 1.0
     fix_sigma_m: float = 5.0
     imu_noise: ImuNoise = field(default_factory=lambda: ImuNoise(*USUAL_IMU_NOISE))
@@ -100,7 +103,9 @@ def bridge_settings(options: BridgeOptions) -> Settings:
         markers=options.markers,
         pose=options.pose_out,
         transforms=options.tf,
+        raw_transforms=options.tf_raw,
         tolerance_s=options.tolerance,
+        smooth_s=options.smooth_s,
         display_s=options.display,
     )
 

@@ -15,16 +15,21 @@ from factorbus.ros2.geometry import Transform, between, carried
 
 _KEPT = 4096
 _KEYFRAMES = 1024
+_IDENTITY = Transform(np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A pose of the map: its key, where odometry had it, its covariance there, that of the way from the one before."""
+    """A pose of the map: its key, where odometry had it, its covariance there, that of the way from the one before.
+
+    T_first_odom: from odometry as it is now to the first one; the identity until it begins anew.
+    """
 
     key: int
     T_odom_base: Transform
     covariance: F64
     way: F64
+    T_first_odom: Transform
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +45,14 @@ class Sample:
     keyframe: Keyframe | None
     way: F64
     unknown: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """T_map_odom by a keyframe that the map has a value of.  T_first_odom: as in Keyframe."""
+
+    T_map_odom: Transform
+    T_first_odom: Transform
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +75,7 @@ class OdometryTrack:
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=_KEPT)
         self._keyframes: deque[Keyframe] = deque(maxlen=_KEYFRAMES)
+        self._T_first_odom = _IDENTITY
 
     @property
     def latest(self) -> Sample | None:
@@ -97,7 +111,11 @@ class OdometryTrack:
         if last is not None:
             T_new_old = T_odom_base @ last.T_odom_base.inverse()
             kept = {each.key: each for each in (*(one.keyframe for one in self._samples), *self._keyframes) if each}
-            moved = {key: replace(each, T_odom_base=T_new_old @ each.T_odom_base) for key, each in kept.items()}
+            self._T_first_odom @= T_new_old.inverse()
+            moved = {
+                key: replace(each, T_odom_base=T_new_old @ each.T_odom_base, T_first_odom=self._T_first_odom)
+                for key, each in kept.items()
+            }
             self._keyframes = deque((moved[each.key] for each in self._keyframes), maxlen=_KEYFRAMES)
             self._samples = deque(
                 (
@@ -130,7 +148,7 @@ class OdometryTrack:
     def mark(self, key: int, at: Sample) -> Keyframe:
         """Make a sample a keyframe; those after it belong to it."""
         way = at.way if at.keyframe is self.keyframe else np.zeros((6, 6))
-        made = Keyframe(key, at.T_odom_base, at.covariance, way)
+        made = Keyframe(key, at.T_odom_base, at.covariance, way, self._T_first_odom)
         self._keyframes.append(made)
         self._samples = deque((_since(made, at, each) for each in self._samples), maxlen=_KEPT)
         return made
@@ -190,6 +208,7 @@ class OdometryTrack:
         """Everything."""
         self._samples.clear()
         self._keyframes.clear()
+        self._T_first_odom = _IDENTITY
 
     def _interpolated(self, stamp_ns: int) -> tuple[Sample, Transform]:
         at = bisect.bisect_right(self._samples, stamp_ns, key=lambda each: each.stamp_ns) - 1

@@ -11,7 +11,7 @@ import click
 from factorbus.cli.output.exits import require
 from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.options import DEFAULT_ENDPOINT, grouped, zenoh_option
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, SECONDS, grouped, zenoh_option
 from factorbus.cli.process.robot_options import robot_options
 from factorbus.ros2.options import BridgeOptions
 
@@ -50,6 +50,14 @@ class NodeOptions:
 @click.option("--node", "node_name", default="factorbus", show_default=True, metavar="NAME", help="Of our node.")
 @robot_options(usual=True)
 @click.option("--tf", default="/tf", show_default=True, metavar="TOPIC", help="Where map to odometry goes.")
+@click.option(
+    "--smooth-s", type=SECONDS, default=0.0, show_default=True, metavar="SECONDS",
+    help="A correction moves that transform over this time, by odometry's stamps, and not at once.",
+)  # fmt: skip
+@click.option(
+    "--tf-raw", default="/factorbus/tf_raw", show_default=True, metavar="TOPIC",
+    help="Where it goes as the map has it, with --smooth-s.",
+)  # fmt: skip
 @click.option("--path", default="/factorbus/path", show_default=True, metavar="TOPIC", help="Where nav_msgs/Path goes.")
 @click.option(
     "--markers", default="/factorbus/markers", show_default=True, metavar="TOPIC",
