@@ -5,7 +5,8 @@
     simulated  manhattan, city_trees, sphere, bearing_range: drives of 1,000 poses, drawn anew in each run
     data       intel, killian_freiburg, manhattan3500, victoria_park, parking_garage, sphere2500
     hard       steps that turn much of a map: loops closed after a drift of 60° to 180° (drift), two robots that meet at
-               any angle (meetings_2d, _3d), positions that come late (late_2d, _3d), wrong loop closures under Huber's
+               any angle (meetings_2d, _3d), positions that come late (late_2d, _3d), ranges to fixed points that do
+               (ranges_2d, _3d), GNSS in a frame that is estimated (frames_2d, _3d), wrong loop closures under Huber's
                loss (outliers)
 
 Our solver takes each drive pose by pose, in this process and without a bus.  After each step full passes over the

@@ -30,7 +30,7 @@ from factorbus.solver import Group, Options, Solver, StepReport
 
 DRAWN = [name for name, world in WORLDS.items() if world.is_drawn]
 SMALL = 60
-LOOPING = {"manhattan": 150, "outliers": 250}  # poses until loops have closed
+LOOPING = {"manhattan": 150, "outliers": 250, "ranges_2d": 150}  # poses until loops have closed, or a map has turned
 SLOPPY = (
     "relinearize_threshold",
     "relinearize_next_step_share",

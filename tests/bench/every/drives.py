@@ -12,7 +12,7 @@ from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS as SIMULATED
 from factorbus.simulate import TreeSensor
 
-from . import hard
+from . import hard, late
 from .motion import PLANE, SPACE
 
 Make = Callable[[int, int], Iterable[Batch]]  # poses (0: all), seed
@@ -63,6 +63,10 @@ WORLDS = {
         World("meetings_3d", partial(hard.meetings, SPACE), 400, "hard"),
         World("late_2d", partial(hard.late_positions, PLANE), 300, "hard"),
         World("late_3d", partial(hard.late_positions, SPACE), 300, "hard"),
+        World("ranges_2d", partial(late.late_ranges, PLANE), 300, "hard"),
+        World("ranges_3d", partial(late.late_ranges, SPACE), 300, "hard"),
+        World("frames_2d", partial(late.late_frames, PLANE), 300, "hard"),
+        World("frames_3d", partial(late.late_frames, SPACE), 300, "hard"),
         *(
             World(name, partial(_data, name), 0, "data")
             for name in ("intel", "killian_freiburg", "manhattan3500", "victoria_park", "parking_garage", "sphere2500")

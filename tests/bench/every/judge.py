@@ -27,6 +27,7 @@ from factorbus.solver.sparse.symbolic import Symbolic, analyze
 COARSE, FINE = 1e-5, 1e-10  # of χ²: where the model of one pass is good enough, and where an optimum is one
 _MOST_PASSES = 200
 _FIRST_DAMPING, _MOST_DAMPING = 1e-5, 1e12
+_ROUNDING, _HARDLY_DAMPED = 1e-12, 1e-2  # of χ²: a step that is damped by so little and wants to gain less ends it
 
 
 class Look(NamedTuple):
@@ -106,6 +107,8 @@ class Judge:
                 return first, min(chi2, self._chi2(trial)), trial, passes
             reached = self._chi2(trial)
             if not reached <= chi2:
+                if 0.0 < damping <= _HARDLY_DAMPED and decrease <= _ROUNDING * max(chi2, UNIT):
+                    return first, chi2, x, passes  # undamped steps leave a bent valley, and others find nothing more
                 damping = _more(damping)
                 continue
             damping = 0.0 if damping < 1e-6 else 0.1 * damping

@@ -20,6 +20,8 @@ from factorbus.solver import Group
 _TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3}
 _H = 1e-6  # metres and radians of a central difference
 _DONE, _MOST_PASSES, _MOST_DAMPING = 1e-10, 200, 1e12
+_FIRST_DAMPING = 1e-5
+_ROUNDING = 1e-14  # of χ²: a hardly damped step that wants to gain less ends, for differences may bar undamped ones
 
 
 class _Factors(NamedTuple):
@@ -64,14 +66,15 @@ class Oracle:
             delta, decrease = problem.step(x, damping)
             trial = problem.moved(x, delta)
             reached = problem.chi2(trial)
-            if damping == 0.0 and decrease <= _DONE * max(chi2, 1.0):
+            wanted = _DONE if damping == 0.0 else _ROUNDING
+            if damping <= _FIRST_DAMPING and decrease <= wanted * max(chi2, 1.0):
                 return first, min(chi2, reached)
             if reached <= chi2:
                 x, chi2, damping = trial, reached, 0.0 if damping < 1e-6 else 0.1 * damping
             elif damping > _MOST_DAMPING:
                 break
             else:
-                damping = max(10 * damping, 1e-5)
+                damping = max(10 * damping, _FIRST_DAMPING)
         raise ArithmeticError(f"no optimum after {_MOST_PASSES} passes; χ² is {chi2:.9g}")
 
 

@@ -5,7 +5,8 @@ between_se3    translation likewise; then the vector part of qz⁻¹qᵢ⁻¹q�
 landmark       r = Rᵢᵀ(l − tᵢ) − z
 bearing_range  r = (wrap(atan2(u_y, u_x) − z₀), |u| − z₁),   u = Rᵢᵀ(l − tᵢ)
 prior          as between_se2 and between_se3 with the identity as xᵢ
-position       r = tᵢ + Rᵢ l − z, where z ends with the lever l
+position       r = tᵢ + Rᵢ l − z, where z ends with the lever l; position_frame: of the pose xⱼ ∘ xᵢ
+range          r = |l − tᵢ| − z
 
 A ratio is χ² over that of an optimum.  Where the optimum is below `UNIT` an excess is taken as it is, not as a share:
 before the first loop an optimum is 0 but for rounding, and data sets whose measurements agree (killian: 5.8e-8) stay
@@ -113,6 +114,26 @@ def _position_se3(a: F64, _: F64, z: F64) -> F64:
     return a[:, :3] + into_frame_3d(back, z[:, 3:]) - z[:, :3]
 
 
+def _position_se2_frame(a: F64, f: F64, z: F64) -> F64:
+    c, s = np.cos(f[:, 2]), np.sin(f[:, 2])
+    x, y = f[:, 0] + c * a[:, 0] - s * a[:, 1], f[:, 1] + s * a[:, 0] + c * a[:, 1]
+    return _position_se2(np.stack((x, y, f[:, 2] + a[:, 2]), axis=1), a, z)
+
+
+def _position_se3_frame(a: F64, f: F64, z: F64) -> F64:
+    back = np.concatenate((np.zeros((len(f), 3)), _conjugate(f[:, 3:])), axis=1)
+    there = np.concatenate((f[:, :3] + into_frame_3d(back, a[:, :3]), _times(f[:, 3:], a[:, 3:])), axis=1)
+    return _position_se3(there, a, z)
+
+
+def _range_se2(a: F64, b: F64, z: F64) -> F64:
+    return np.linalg.norm(b - a[:, :2], axis=1)[:, None] - z
+
+
+def _range_se3(a: F64, b: F64, z: F64) -> F64:
+    return np.linalg.norm(b - a[:, :3], axis=1)[:, None] - z
+
+
 RESIDUALS: dict[str, Callable[[F64, F64, F64], F64]] = {
     "between_se2": _between_se2,
     "between_se3": _between_se3,
@@ -123,4 +144,8 @@ RESIDUALS: dict[str, Callable[[F64, F64, F64], F64]] = {
     "prior_se3": _prior_se3,
     "position_se2": _position_se2,
     "position_se3": _position_se3,
+    "position_se2_frame": _position_se2_frame,
+    "position_se3_frame": _position_se3_frame,
+    "range_se2": _range_se2,
+    "range_se3": _range_se3,
 }

@@ -36,7 +36,11 @@ def gtsam_factors(group: Factors, as_gtsam_reads: bool = False) -> Iterator[Any]
 
 
 def held(kind: str, key: int, values: Any) -> Any:
-    """A prior that holds a pose where it is."""
+    """A prior that holds a pose, or a point, where it is."""
+    if kind == "point2":
+        return gtsam.PriorFactorPoint2(key, values.atPoint2(key), gtsam.noiseModel.Isotropic.Sigma(2, _TIGHT))
+    if kind == "point3":
+        return gtsam.PriorFactorPoint3(key, values.atPoint3(key), gtsam.noiseModel.Isotropic.Sigma(3, _TIGHT))
     if kind == "se2":
         return gtsam.PriorFactorPose2(key, values.atPose2(key), gtsam.noiseModel.Isotropic.Sigma(3, _TIGHT))
     return gtsam.PriorFactorPose3(key, values.atPose3(key), gtsam.noiseModel.Isotropic.Sigma(6, _TIGHT))
