@@ -1,6 +1,6 @@
 """Kinds that clients write themselves: the solver does with them what it does with its own."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -81,7 +81,7 @@ def test_covariance_gate_gain_and_why_are_those_of_the_solvers_kinds() -> None:
     close(there.joint(some), here.joint(some), 1e-6)
     *_, (last, _) = both(3)
     groups = [FactorGroup(g.kind, g.keys, g.measured, 0.1 * g.information) for g in last.factors]
-    of_own = [replace(g, kind=OWN[g.kind].name) if g.kind in OWN else g for g in groups]
+    of_own = [g._replace(kind=OWN[g.kind].name) if g.kind in OWN else g for g in groups]
     wanted, found = evaluate_candidates(here, groups), evaluate_candidates(there, of_own)
     np.testing.assert_allclose(found.distance, wanted.distance, rtol=1e-4)
     np.testing.assert_allclose(found.gain, wanted.gain, rtol=1e-6)
