@@ -173,7 +173,7 @@ class HeldMirror:
 
 @pytest.mark.parametrize("told", [True, False])
 def test_a_value_of_another_epoch_is_no_correction(told: bool) -> None:
-    """Also where one asks after the map has come and before its delta is told."""
+    """Also where one asks after the map has come and before its delta is passed on."""
     mirror = HeldMirror()
     poses = SmoothedPoses(mirror, Clock())  # type: ignore[arg-type]
     poses.pose("x1", 1.0)

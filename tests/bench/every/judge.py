@@ -108,7 +108,7 @@ class Judge:
             reached = self._chi2(trial)
             if not reached <= chi2:
                 if 0.0 < damping <= _HARDLY_DAMPED and decrease <= _ROUNDING * max(chi2, UNIT):
-                    return first, chi2, x, passes  # undamped steps leave a bent valley, and others find nothing more
+                    return first, chi2, x, passes  # undamped steps leave a curved valley, and others find nothing more
                 damping = _more(damping)
                 continue
             damping = 0.0 if damping < 1e-6 else 0.1 * damping

@@ -226,7 +226,7 @@ class TrustedForest:
 
 
 def _copied(group: FactorsLike) -> FactorGroup:
-    """With arrays of its own: whoever sent it may use them again, and they may be views of a whole message."""
+    """With arrays of its own: the sender may use them again, and they may be views of a whole message."""
     scale = None if group.scale is None else group.scale.copy()
     return FactorGroup(
         group.kind, group.keys.copy(), group.measured.copy(), group.information.copy(), group.loss, scale
