@@ -72,14 +72,20 @@ def list_closure_ends(v0: int, f0: int, closing: I64, graph_table: I64, free: I6
             moved[e, k] = motion[own, k]
         place = -1
         if var[v, at.V_SCALAR] >= 0:
-            place = 0
-            while place < count and free[place] != v:
-                place += 1
-            if place == count:
-                free[count] = v
-                count += 1
+            place = place_among(free, count, v)
+            count = max(count, place + 1)
         ends[e, END_BASE], ends[e, END_PLACE] = v, place
     return count
+
+
+@inline_kernel
+def place_among(free: I64, count: int, v: int) -> int:
+    """Where v is among the first `count` of `free`; if it is not, it becomes the next."""
+    place = 0
+    while place < count and free[place] != v:
+        place += 1
+    free[place] = v
+    return place
 
 
 @inline_kernel

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factorbus.solver.kernels.closures.ahead import pose_of, residual_weighed
+from factorbus.solver.kernels.closures.ahead import place_among, pose_of, residual_weighed
 from factorbus.solver.kernels.closures.plane import add_predicted, motion_to, put_adjoint, put_weight_without
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel
 from factorbus.solver.kernels.model import layout as at
@@ -54,12 +54,8 @@ def list_free_ends(rows: I64, ends: I64, graph_table: I64, free: I64, places: I6
             v = ends[rows[k], e]
             place = -1
             if var[v, at.V_SCALAR] >= 0:
-                place = 0
-                while place < count and free[place] != v:
-                    place += 1
-                if place == count:
-                    free[count] = v
-                    count += 1
+                place = place_among(free, count, v)
+                count = max(count, place + 1)
             places[k, e] = place
     return count
 
