@@ -11,6 +11,7 @@ from journal_ends import End, drive, pose
 
 from factorbus.client import Unavailable
 from factorbus.journal.problems import JournalUnreadable
+from factorbus.journal.store import Store
 from factorbus.proto.problems import Problem
 from factorbus.proto.records import (
     JournalPlace,
@@ -126,6 +127,25 @@ def test_a_journal_that_cannot_be_read_once_is_read_again(
         assert faults == []
         following.until(lambda: following.replicas.row("m")["upstream"]["behind"] == 0)
         assert following.replicas.row("m")["upstream"]["code"] == ""
+
+
+def test_what_is_written_while_following_begins_is_counted_once(
+    ends: tuple[End, End], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, base = ends
+    drive(robot, "x", 0, 5)
+    records, grows = Store.records, threading.Event()
+
+    def grown(store: Store, after: int = 0) -> Any:
+        if threading.current_thread().name == "upstream" and not grows.is_set():
+            grows.set()
+            drive(robot, "x", 5, 8)
+        return records(store, after)
+
+    monkeypatch.setattr(Store, "records", grown)
+    with Following(robot, Played(base)) as following:
+        following.until(lambda: grows.is_set() and robot.place() == base.place())
+        following.until(lambda: following.replicas.row("m")["upstream"]["behind"] == 0)
 
 
 def test_what_comes_in_many_answers_is_put_in_once_and_named_inserts_are_found(ends: tuple[End, End]) -> None:

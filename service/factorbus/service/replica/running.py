@@ -231,7 +231,9 @@ class Replicas:
             place, last = upstream_of(store), keeper.last
             if place.record > last.record:  # the end of the journal was lost in a crash
                 place = UpstreamPlace(*JournalPlace())
-            behind = sum(count_inserts(record.entries) for record in store.records(place.record))
+            # The journal may have grown since: of what is newer `_wrote` will hear.
+            own = islice(store.records(place.record), last.record - place.record)
+            behind = sum(count_inserts(record.entries) for record in own)
         except (JournalDamaged, JournalUnreadable) as problem:
             self._cannot_follow(name, problem)
             return
