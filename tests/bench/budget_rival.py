@@ -16,7 +16,7 @@ import numpy as np
 from bench.replays.chi2 import chi2_at
 from bench.replays.columns import F64, I64, columns_of
 from bench.replays.contestants import Failed
-from bench.replays.isam2 import Isam2
+from bench.replays.isam2 import Isam2, Isam2Settings
 
 from factorbus.proto.messages import Batch
 
@@ -37,7 +37,7 @@ class Isam2WithinBudget(Isam2):
     """
 
     def __init__(self, budget_ms: float) -> None:
-        super().__init__(THRESHOLD, _FACTORIZATION, WILDFIRE)
+        super().__init__(Isam2Settings(THRESHOLD, _FACTORIZATION, WILDFIRE))
         self._budget_ms, self._ms_each, self._ms_beside = budget_ms, _FIRST_MS, 0.0
         self._dims: dict[int, int] = {}
         self.took_ms, self.took_cpu_s, self.held_back = 0.0, 0.0, 0

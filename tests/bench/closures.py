@@ -126,9 +126,9 @@ def _drive(drive: DriveWithFalse, name: str) -> dict[str, Any]:
 
 
 def _isam2() -> Any:
-    from replays.isam2 import Isam2  # who does not ask for it need not have GTSAM
+    from replays.isam2 import Isam2, Isam2Settings  # who does not ask for it need not have GTSAM
 
-    return Isam2(0.1, "CHOLESKY", 1e-3)
+    return Isam2(Isam2Settings(0.1))
 
 
 def _with_loss(batch: Batch, loss: str) -> Batch:

@@ -3,8 +3,10 @@
     python tests/bench/peers.py [--quick] [--only NAME,...] [--json [FILE]] [--repetitions N] [--fresh] [...]
 
     replays    pose by pose, all eleven data sets: CPU time of `auto`, all variables read after every step, against that
-               of iSAM2's `update()` alone; long steps; χ²/χ²_batch at every step (--chi2-every N: at each Nth), in
-               another replay than the timed ones
+               of iSAM2's `update()` alone, with relinearizeSkip 1 and, as it ships, 10; long steps; χ²/χ²_batch at
+               every step (--chi2-every N: at each Nth), in another replay than the timed ones
+    worlds     the same on eight simulated worlds, each with the seed that was looked at while constants were chosen and
+               with one that is drawn for the run and printed (--seed N: that one)
     growth     a simulated drive of 100,000 poses: the time of a step and the memory as the map grows
     cores      what a second core brings for the longest steps of 20,000 poses, by the clock
     full-pass  relinearize, order, analyse, factorize and solve each final system, against CHOLMOD with OpenBLAS
@@ -14,13 +16,15 @@ Every run is a process of its own on one core, three repetitions, medians, and i
 (out/bench/peers): a second call goes on where the first was stopped and measures only what is new or changed.
 --quick takes two minutes, and does not judge what it shortens.  Without data sets it replays simulated worlds.
 
-NAME is a part (replays, growth, cores, full-pass, overhead), a data set (intel, w10000, ...) or a solver: auto,
-isam2-0.1, and when asked for isam2-0.01, gn-loop (one Gauss-Newton step on a fresh block Cholesky at every loop) or
-another of our modes (all-batch, inc-l, ...); --judge holds that against the targets.  The exit code is 1 when a target
-is missed.
+NAME is a part (replays, worlds, growth, cores, full-pass, overhead), a data set (intel, w10000, ...) or a solver:
+auto, isam2-0.1, isam2-0.1-skip10, and when asked for isam2-0.01, isam2-0.01-skip10, isam2-0.1-adaptive (adaptive
+reordering), isam2-0.1-partial (partial relinearization check), gn-loop (one Gauss-Newton step on a fresh block Cholesky
+at every loop) or another of our modes (all-batch, inc-l, ...); --judge holds that against the targets.  The exit code
+is 1 when a target is missed.
 """
 
 import argparse
+import secrets
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,21 +34,18 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bench.replays import peer_summary, peer_table, peer_targets, problems, runner, summary, targets
+from bench.replays import peer_summary, peer_table, peer_targets, problems, runner, summary, targets, world_targets
 from bench.replays.bars import Begin, Tell, bars
 from bench.replays.command import add_options, hand_out, positive
-from bench.replays.contestants import ENTRIES, OURS, PEER, STAND_IN, Entry
+from bench.replays.contestants import ENTRIES, ISAM2_NAMES, OURS, PEER, SKIPPING, STAND_INS, Entry
 from bench.replays.problems import ALL, Problem
 from bench.replays.samples import Sampling
 
 from factorbus.service.process.worker_threads import core_count
 
-PARTS = ("replays", "growth", "cores", "full-pass", "overhead")
+PARTS = ("replays", "worlds", "growth", "cores", "full-pass", "overhead")
 OUR_MODES = tuple(name for name, entry in ENTRIES.items() if entry.solver == OURS)
-SOLVERS = {
-    **{name: name for name in (*OUR_MODES, "gn-loop")},
-    **{f"isam2-{threshold}": f"isam2-{threshold}-update" for threshold in ("0.1", "0.01")},
-}
+SOLVERS = {**{name: name for name in (*OUR_MODES, "gn-loop")}, **ISAM2_NAMES}
 GROWTH = Problem("manhattan", "Manhattan", poses=100_000, seed=1)
 _QUICK_GROWTH = 2_000
 _CORES_POSES = 20_000
@@ -64,14 +65,24 @@ class Plan:
     quick: bool
     judged: str
     chi2_every: int = 1
+    worlds: tuple[Problem, ...] = ()
+
+    @property
+    def replayed(self) -> list[Problem]:
+        """By each solver."""
+        return [*(self.chosen if "replays" in self.parts else ()), *self.worlds]
+
+    def times(self, problem: Problem) -> int:
+        """How often it is replayed."""
+        return 1 if problem in self.worlds else self.repetitions
 
     def jobs(self) -> int:
         """How many."""
-        references = len(self.chosen) if {"replays", "full-pass"} & set(self.parts) else 0
-        replays = len(self.chosen) * len(self.entries) * self.repetitions if "replays" in self.parts else 0
+        references = len(self.worlds) + (len(self.chosen) if {"replays", "full-pass"} & set(self.parts) else 0)
+        replays = sum(map(self.times, self.replayed)) * len(self.entries)
         growth = self.repetitions if "growth" in self.parts else 0
         passes = len(self.chosen) if "full-pass" in self.parts else 0
-        looks = len(self.chosen) * len(self.entries) if "replays" in self.parts and self.chi2_every < RARE else 0
+        looks = len(self.replayed) * len(self.entries) if self.chi2_every < RARE else 0
         return references + replays + looks + growth + passes + ("cores" in self.parts) + ("overhead" in self.parts)
 
 
@@ -80,7 +91,7 @@ def main() -> None:
     options = _options()
     chosen, note = problems.choose(options.quick, ALL)
     plan, absent = _plan(options, chosen)
-    sampling = Sampling(every=options.chi2_every if "replays" in plan.parts else RARE)
+    sampling = Sampling(every=options.chi2_every if plan.replayed else RARE)
     settings = runner.Settings(options.out, runner.pick_core(), sampling, options.limit_s, options.fresh)
     try:
         with bars(plan.jobs()) as (begin, progress):
@@ -101,12 +112,10 @@ def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell)
     """references and runs by data set; growth, cores, full_pass and overhead where they are in the plan."""
     found: dict[str, Any] = {"references": {}, "runs": {}, "growth": [], "full_pass": {}}
     found |= {"cores": None, "overhead": None}
-    if {"replays", "full-pass"} & set(plan.parts):
-        for problem in plan.chosen:
-            begin(f"{problem.key}: optima", problem.steps)
-            found["references"][problem.key] = runner.run_reference(settings, problem, progress)
-    if "replays" in plan.parts:
-        found["runs"] = _replays(settings, plan, begin, progress)
+    for problem in dict.fromkeys([*plan.replayed, *(plan.chosen if "full-pass" in plan.parts else ())]):
+        begin(f"{problem.key}: optima", problem.steps)
+        found["references"][problem.key] = runner.run_reference(settings, problem, progress)
+    found["runs"] = _replays(settings, plan, begin, progress)
     if "growth" in plan.parts:
         world = GROWTH.shortened(_QUICK_GROWTH) if plan.quick else GROWTH
         for repetition in range(plan.repetitions):
@@ -138,19 +147,19 @@ def _replays(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell
     Looks at χ² that are not rare are made in replays that are not timed.
     """
     looked, settings = settings, replace(settings, sampling=Sampling(every=max(plan.chi2_every, RARE)))
-    runs: dict[str, dict[str, list[Any]]] = {p.key: {} for p in plan.chosen}
+    runs: dict[str, dict[str, list[Any]]] = {p.key: {} for p in plan.replayed}
     for repetition in range(plan.repetitions):
-        for problem in plan.chosen:
+        for problem in (each for each in plan.replayed if repetition < plan.times(each)):
             for entry in plan.entries:
                 begin(f"{problem.key}: {entry.name}", problem.steps)
                 run = runner.run_replay(settings, problem, entry, repetition, progress)
                 runs[problem.key].setdefault(entry.name, []).append(run)
-                if entry.name == PEER and run["status"] == "failed":
-                    begin(f"{problem.key}: {STAND_IN}", problem.steps)
-                    run = runner.run_replay(settings, problem, ENTRIES[STAND_IN], repetition, progress)
-                    runs[problem.key].setdefault(STAND_IN, []).append(run)
+                if run["status"] == "failed" and (stand_in := STAND_INS.get(entry.name)):
+                    begin(f"{problem.key}: {stand_in}", problem.steps)
+                    run = runner.run_replay(settings, problem, ENTRIES[stand_in], repetition, progress)
+                    runs[problem.key].setdefault(stand_in, []).append(run)
     if plan.chi2_every < RARE:
-        for problem in plan.chosen:
+        for problem in plan.replayed:
             for name, each in runs[problem.key].items():
                 begin(f"{problem.key}: χ² of {name}", problem.steps)
                 each[0] = looked_at(looked, problem, each[0], progress)
@@ -171,14 +180,13 @@ def looked_at(settings: runner.Settings, problem: Problem, run: dict[str, Any], 
 def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[dict[str, Any], list[targets.Verdict]]:
     """The document, and the verdicts."""
     rows, said, ends = [], [note for note in notes if note], {}
-    if "replays" in plan.parts:
-        for problem in plan.chosen:
-            mine = found["runs"][problem.key]
-            firsts = [each[0] for name, each in mine.items() if name != STAND_IN]
-            batch, remarks = summary.best_known(problem, found["references"][problem.key], firsts)
-            said += remarks
-            ends[problem.key] = batch[max(batch)]
-            rows += peer_summary.rows_of(problem, [ENTRIES[name] for name in mine], mine, batch)
+    for problem in plan.replayed:
+        mine = found["runs"][problem.key]
+        firsts = [each[0] for name, each in mine.items() if name not in STAND_INS.values()]
+        batch, remarks = summary.best_known(problem, found["references"][problem.key], firsts)
+        said += remarks
+        ends[problem.key] = batch[max(batch)]
+        rows += peer_summary.rows_of(problem, [ENTRIES[name] for name in mine], mine, batch)
     growth, overhead = _together(found["growth"]), found["overhead"]
     crashed = overhead["reason"] if overhead and "step" not in overhead else ""
     if crashed:
@@ -186,6 +194,7 @@ def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[d
         overhead = None
     verdicts = [
         *peer_targets.judge(rows, ends, plan.judged),
+        *world_targets.judge_worlds(rows, plan.worlds, plan.judged),
         *peer_targets.judge_growth(growth),
         *peer_targets.judge_cores(found["cores"], _CORES_POSES),
         *peer_targets.judge_passes(found["full_pass"]),
@@ -209,7 +218,7 @@ def draw(folder: Path, found: dict[str, Any], document: dict[str, Any], plan: Pl
     from bench.replays import figures, peer_figures
 
     folder.mkdir(parents=True, exist_ok=True)
-    paths, titles = [], {p.key: p.label for p in plan.chosen}
+    paths, titles = [], {p.key: p.label for p in plan.replayed}
     if document["rows"]:
         runs = {key: [each[0] for each in by_name.values()] for key, by_name in found["runs"].items()}
         paths = [folder / f"peers_{name}.png" for name in ("steps", "time", "ratios")]
@@ -259,18 +268,21 @@ def _plan(options: argparse.Namespace, chosen: list[Problem]) -> tuple[Plan, lis
         )
     if not parts:
         parts = ("replays",) if wanted or names else PARTS
-    entries = [ENTRIES[name] for name in names or (options.judge, PEER)]
+    entries = [ENTRIES[name] for name in names or (options.judge, PEER, SKIPPING)]
     absent = [f"Not measured: {entry.label} ({entry.missing()})." for entry in entries if entry.missing()]
     entries = [entry for entry in entries if not entry.missing()]
     repetitions = options.repetitions or (1 if options.quick else 3)
-    plan = Plan(parts, wanted or chosen, entries, repetitions, options.quick, options.judge, options.chi2_every)
-    return plan, absent
+    poses = problems.QUICK_POSES if options.quick else problems.WORLD_POSES
+    worlds = tuple(problems.drawn(options.seed, poses)) if "worlds" in parts else ()
+    plan = Plan(parts, wanted or chosen, entries, repetitions, options.quick, options.judge, options.chi2_every, worlds)
+    return plan, [*absent, *[f"Worlds are drawn with seed {options.seed}."] * bool(worlds)]
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_options(parser, "peers", repetitions=None)
     parser.add_argument("--chi2-every", type=positive, default=1, metavar="N", help="look at χ² at each Nth step (1)")
+    parser.add_argument("--seed", type=positive, default=secrets.randbelow(1 << 30) + 2, help="of worlds (drawn anew)")
     parser.add_argument("--judge", choices=OUR_MODES, default="auto", help="the mode that the targets are for")
     return parser.parse_args()
 

@@ -21,6 +21,7 @@ from bench.every.rows import far_steps, row_of, together
 from bench.every.verdicts import judge
 from bench.replays.contestants import Failed
 from bench.replays.gtsam_factors import gtsam_factors, pose3
+from bench.replays.isam2 import Isam2Settings
 from bench.replays.targets import MET, MISSED, NOT_MEASURED
 
 from factorbus.cli.commands import bench
@@ -195,7 +196,7 @@ def test_isam2_s_problem_is_ours_to_first_order() -> None:
     """Residuals of both conventions agree to first order: χ² of estimates near the optimum is nearly the same."""
     for name in ("manhattan", "city_trees", "sphere", "bearing_range", "outliers"):
         steps = steps_of(name)
-        isam2, theirs, ours = Watched(0.1, "CHOLESKY", 1e-5), Isam2Judge(), Judge()
+        isam2, theirs, ours = Watched(Isam2Settings(0.1, wildfire=1e-5)), Isam2Judge(), Judge()
         for batch in steps:
             isam2.prepare(batch)
             theirs.take_in(*isam2.prepared())
@@ -235,7 +236,7 @@ def test_isam2_s_positions_with_a_lever_are_refused() -> None:
 
 def test_isam2_is_judged_by_gtsam_s_own_batch() -> None:
     steps = steps_of("manhattan", 150)
-    isam2, theirs, graph = Watched(0.1, "CHOLESKY", 1e-3), Isam2Judge(), gtsam.NonlinearFactorGraph()
+    isam2, theirs, graph = Watched(Isam2Settings(0.1)), Isam2Judge(), gtsam.NonlinearFactorGraph()
     for batch in steps:
         isam2.prepare(batch)
         graph.push_back(isam2.prepared()[0])

@@ -90,7 +90,7 @@ def test_the_command_measures_prints_and_draws(tmp_path: Path) -> None:
     assert ran.returncode == 0, ran.stderr[-2000:]
     document = json.loads(ran.stdout)
     (row,) = document["rows"]
-    assert row["dataset"] == "city_trees-600"
+    assert row["dataset"] == "city_trees-600-1"
     assert row["chi2_ratio"]["max"] == pytest.approx(1, abs=1e-3)
     assert set(row["step_ms"]) == {"p50", "p95", "p99", "max"}
     assert {"factorbus", "numpy", "numba", "python"} <= set(row["versions"])

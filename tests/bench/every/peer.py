@@ -9,7 +9,7 @@ from typing import Any
 import gtsam
 from bench.replays.chi2 import UNIT
 from bench.replays.contestants import Failed
-from bench.replays.isam2 import Isam2
+from bench.replays.isam2 import Isam2, Isam2Settings
 
 from factorbus.proto.messages import Batch
 
@@ -102,7 +102,7 @@ def follow_isam2(
 def _followed(
     batches: Sequence[Batch], factorization: str, every: int, progress: Callable[[int], None]
 ) -> tuple[list[Look], str]:
-    isam2, judge, looks = Watched(THRESHOLD, factorization, WILDFIRE), Isam2Judge(), []
+    isam2, judge, looks = Watched(Isam2Settings(THRESHOLD, factorization, WILDFIRE)), Isam2Judge(), []
     for k, batch in enumerate(batches):
         try:
             isam2.prepare(batch)

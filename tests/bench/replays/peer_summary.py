@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from . import summary
-from .contestants import ISAM2_ALONE, PEER, STAND_IN, Entry
+from .contestants import ISAM2_ALONE, PEER, SKIPPING, STAND_INS, Entry
 from .problems import Problem
 
 Run = dict[str, Any]
@@ -21,10 +21,11 @@ def rows_of(
     ratio_to_isam2: its time over that of iSAM2's `update()`, medians over the repetitions, both up to the last step
     that both made (ratio_steps), None where one of them made none; ratio_spread: least and largest of a repetition;
     ratio_against: the name of that iSAM2, which is the stand-in where only that went through.
+    ratio_to_skip10: the same over that of iSAM2 that relinearizes at every tenth update.
     chi2_ratio_common: chi2_ratio at the samples that iSAM2 has too.  chi2_settled: at the end, iterated until it had
     converged; ours only.
     """
-    against = _peer_of(runs)
+    against, skipping = _peer_of(runs, PEER), _peer_of(runs, SKIPPING)
     peers, rows = [run for run in runs.get(PEER, ()) if run.get("done")], []
     for entry in entries:
         row, mine = summary.row_of(problem, entry, runs[entry.name], batch), runs[entry.name]
@@ -33,16 +34,17 @@ def rows_of(
             row["read_s"] = _median_of([run["facts"].get("read_s") for run in mine])
             row["work"].pop("read_s", None)
         row |= {"ratio_against": against, **_against(mine, runs.get(against, ()))}
+        row["ratio_to_skip10"] = _against(mine, runs.get(skipping, ()))["ratio_to_isam2"]
         last = max((step for step, _ in peers[0]["chi2"]), default=-1) if peers else -1
         row["chi2_ratio_common"] = summary.ratio_statistics([s for s in mine[0]["chi2"] if s[0] <= last], batch)
         rows.append(row)
     return rows
 
 
-def _peer_of(runs: dict[str, list[Run]]) -> str:
+def _peer_of(runs: dict[str, list[Run]], peer: str) -> str:
     """Whose time counts: the stand-in's, if it came further."""
-    reached = {name: max((run.get("done", 0) for run in runs.get(name, ())), default=0) for name in (PEER, STAND_IN)}
-    return STAND_IN if reached[STAND_IN] > reached[PEER] else PEER
+    reached = {name: max((r.get("done", 0) for r in runs.get(name, ())), default=0) for name in (peer, STAND_INS[peer])}
+    return max(reached, key=reached.__getitem__)
 
 
 def time_until(run: Run, steps: int) -> float:

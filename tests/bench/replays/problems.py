@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from factorbus import simulate
 from factorbus.datasets import CATALOGUE, Places, dataset_named, find, locate
 from factorbus.formats import read
 from factorbus.proto.messages import Batch
-from factorbus.simulate import WORLDS
+
+from . import worlds
+from .worlds import WORLDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +41,14 @@ class Problem:
     def label(self) -> str:
         """The name that tells a shortened replay and a simulated world from the data set."""
         if self.is_world:
-            return f"{self.title} (simulated, {self.poses})"
+            return f"{self.title} (simulated, {self.poses}, seed {self.seed})"
         return f"{self.title} (first {self.poses})" if self.poses else self.title
 
     @property
     def key(self) -> str:
         """The name in file names and rows."""
-        return f"{self.name}-{self.poses}" if self.poses else self.name
+        parts = (self.name, self.poses, self.seed) if self.is_world else (self.name, self.poses)
+        return "-".join(str(part) for part in parts if part)
 
     @property
     def steps(self) -> int:
@@ -68,6 +72,10 @@ SIMULATED = (
     Problem("manhattan", "Manhattan", poses=1200, seed=1),
     Problem("city_trees", "CityTrees", poses=1200, seed=1),
 )
+# Seeds of worlds that may be looked at while constants are chosen; of the others each run draws one.
+LOOKED_AT = 1
+WORLD_POSES, QUICK_POSES = 2000, 300
+_TITLES = {"manhattan": "Streets", "city_trees": "Trees by streets"}
 # For a run of two minutes.
 QUICK = {"intel": 0, "killian": 0, "manhattan3500": 1000}
 
@@ -90,10 +98,16 @@ def choose(quick: bool, of: Sequence[Problem] = PAPER) -> tuple[list[Problem], s
     return worlds, f"{note} These are simulated worlds, which say nothing about the data sets."
 
 
+def drawn(seed: int, poses: int = WORLD_POSES) -> list[Problem]:
+    """Every world twice: with the seed that may be looked at, and with this one."""
+    titles = {name: _TITLES.get(name, name.replace("_", " ").capitalize()) for name in WORLDS}
+    return [Problem(name, title, poses, None, each) for name, title in titles.items() for each in (LOOKED_AT, seed)]
+
+
 def load(problem: Problem) -> Sequence[Batch]:
     """Its replay: one batch a pose, without values but that of the first pose, which is fixed.  Raises FormatError."""
     if problem.is_world:
-        return [step.batch for step in WORLDS[problem.name](problem.poses, problem.seed)]
+        return [*WORLDS[problem.name](problem.poses, problem.seed)]
     steps = read(file_of(problem.name)).steps()
     return steps[: problem.poses] if problem.poses else steps
 
@@ -102,7 +116,7 @@ def fingerprint(problem: Problem) -> str:
     """Changes when the replay does."""
     said = hashlib.sha256(json.dumps([problem.name, problem.poses, problem.seed]).encode())
     if problem.is_world:
-        for source in sorted(Path(WORLDS[problem.name].__code__.co_filename).parent.glob("*.py")):
+        for source in (Path(worlds.__file__), *sorted(Path(simulate.__file__).parent.glob("*.py"))):
             said.update(source.read_bytes())
     else:
         said.update(file_of(problem.name).read_bytes())
