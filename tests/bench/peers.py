@@ -7,6 +7,7 @@
                every step (--chi2-every N: at each Nth), in another replay than the timed ones
     worlds     the same on eight simulated worlds, each with the seed that was looked at while constants were chosen and
                with one that is drawn for the run and printed (--seed N: that one)
+    bus        the data sets through a service: from an insert to the estimate with it, by the robot's clock, two cores
     growth     a simulated drive of 100,000 poses: the time of a step and the memory as the map grows
     cores      what a second core brings for the longest steps of 20,000 poses, by the clock
     full-pass  relinearize, order, analyse, factorize and solve each final system, against CHOLMOD with OpenBLAS
@@ -16,7 +17,7 @@ Every run is a process of its own on one core, three repetitions, medians, and i
 (out/bench/peers): a second call goes on where the first was stopped and measures only what is new or changed.
 --quick takes two minutes, and does not judge what it shortens.  Without data sets it replays simulated worlds.
 
-NAME is a part (replays, worlds, growth, cores, full-pass, overhead), a data set (intel, w10000, ...) or a solver:
+NAME is a part (replays, worlds, bus, growth, cores, full-pass, overhead), a data set (intel, w10000, ...) or a solver:
 auto, isam2-0.1, isam2-0.1-skip10, and when asked for isam2-0.01, isam2-0.01-skip10, isam2-0.1-adaptive (adaptive
 reordering), isam2-0.1-partial (partial relinearization check), gn-loop (one Gauss-Newton step on a fresh block Cholesky
 at every loop) or another of our modes (all-batch, inc-l, ...); --judge holds that against the targets.  The exit code
@@ -43,7 +44,7 @@ from bench.replays.samples import Sampling
 
 from factorbus.service.process.worker_threads import core_count
 
-PARTS = ("replays", "worlds", "growth", "cores", "full-pass", "overhead")
+PARTS = ("replays", "worlds", "bus", "growth", "cores", "full-pass", "overhead")
 OUR_MODES = tuple(name for name, entry in ENTRIES.items() if entry.solver == OURS)
 SOLVERS = {**{name: name for name in (*OUR_MODES, "gn-loop")}, **ISAM2_NAMES}
 GROWTH = Problem("manhattan", "Manhattan", poses=100_000, seed=1)
@@ -83,7 +84,9 @@ class Plan:
         growth = self.repetitions if "growth" in self.parts else 0
         passes = len(self.chosen) if "full-pass" in self.parts else 0
         looks = len(self.replayed) * len(self.entries) if self.chi2_every < RARE else 0
-        return references + replays + looks + growth + passes + ("cores" in self.parts) + ("overhead" in self.parts)
+        over_bus = len(self.chosen) if "bus" in self.parts else 0
+        single = ("cores" in self.parts) + ("overhead" in self.parts)
+        return references + replays + looks + over_bus + growth + passes + single
 
 
 def main() -> None:
@@ -109,13 +112,18 @@ def main() -> None:
 
 
 def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell) -> dict[str, Any]:
-    """references and runs by data set; growth, cores, full_pass and overhead where they are in the plan."""
-    found: dict[str, Any] = {"references": {}, "runs": {}, "growth": [], "full_pass": {}}
+    """references and runs by data set; over_bus, growth, cores, full_pass, overhead where they are in the plan."""
+    found: dict[str, Any] = {"references": {}, "runs": {}, "growth": [], "full_pass": {}, "over_bus": {}}
     found |= {"cores": None, "overhead": None}
     for problem in dict.fromkeys([*plan.replayed, *(plan.chosen if "full-pass" in plan.parts else ())]):
         begin(f"{problem.key}: optima", problem.steps)
         found["references"][problem.key] = runner.run_reference(settings, problem, progress)
     found["runs"] = _replays(settings, plan, begin, progress)
+    if "bus" in plan.parts:
+        for problem in plan.chosen:
+            begin(f"{problem.key}: over the bus", problem.steps)
+            both = replace(settings, core=None)
+            found["over_bus"][problem.key] = _measured(both, problem, "over_bus", {}, progress)
     if "growth" in plan.parts:
         world = GROWTH.shortened(_QUICK_GROWTH) if plan.quick else GROWTH
         for repetition in range(plan.repetitions):
@@ -205,6 +213,7 @@ def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[d
         "notes": said,
         "judged": plan.judged,
         "rows": rows,
+        "over_bus": found["over_bus"],
         "growth": growth,
         "cores": found["cores"],
         "full_pass": found["full_pass"],

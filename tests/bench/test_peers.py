@@ -17,6 +17,7 @@ from bench.replays import (
     cores,
     full_pass,
     growth,
+    over_bus,
     overhead,
     peer_summary,
     peer_table,
@@ -306,6 +307,14 @@ def test_the_solvers_own_account_of_compiled_time_is_preferred() -> None:
         assert inside(Report()) == 0.25e-3
 
 
+def test_a_replay_over_the_bus_is_timed_by_the_robot() -> None:
+    found = over_bus.over_bus({}, Problem("manhattan", "Manhattan", poses=80, seed=3), SILENT)
+    assert found["steps"] == 80
+    assert 0 < found["insert_ms"]["p50"] <= found["insert_ms"]["p99"] <= found["insert_ms"]["max"]
+    assert "| intel | 80 |" in peer_table.bus_table({"intel": found})
+    assert "| intel | exit code 1 |" in peer_table.bus_table({"intel": {"status": "failed", "reason": "exit code 1"}})
+
+
 def test_a_start_compiles_nothing() -> None:
     warm()
     started = overhead.starts("auto")
@@ -410,7 +419,7 @@ def test_an_unknown_name_is_refused_with_those_there_are() -> None:
         [sys.executable, str(PEERS), "--only", "intle"], capture_output=True, text=True, timeout=60, check=False
     )
     assert ran.returncode == 1
-    assert "--only intle: none of the parts (replays, worlds, growth, cores, full-pass, overhead)" in ran.stderr
+    assert "--only intle: none of the parts (replays, worlds, bus, growth, cores, full-pass, overhead)" in ran.stderr
 
 
 def world_rows(**more: float) -> tuple[list[dict[str, Any]], list[Problem]]:

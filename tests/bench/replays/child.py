@@ -151,7 +151,7 @@ _JOBS: dict[str, Job] = {
     "quality": quality,
     "reference": reference,
     "fill": fill,
-    **{kind: _measure(kind) for kind in ("growth", "cores", "full_pass", "overhead")},
+    **{kind: _measure(kind) for kind in ("growth", "cores", "full_pass", "overhead", "over_bus")},
 }
 
 

@@ -23,6 +23,8 @@ def report(document: dict[str, Any], verdicts: Sequence[Verdict]) -> str:
             mine = [row for row in rows if row["dataset"] == dataset]
             parts += [f"### {mine[0]['title']}: {mine[0]['steps']} steps", details(mine)]
             parts += [f"- {row['name']}: {row['note']}" for row in mine if row["status"] != "done"]
+    if document["over_bus"]:
+        parts += ["## Over the bus", bus_table(document["over_bus"])]
     if document["growth"]:
         parts += ["## Growth", growth_table(document["growth"])]
     if document["cores"]:
@@ -57,6 +59,19 @@ def main_table(rows: Sequence[dict[str, Any]], judged: str = OURS) -> str:
         cells += [number(quality.get(name), "{:.6f}") for name in ("median", "p95", "p99", "max")]
         cells.append(number(row["chi2_settled"], "{:.9g}"))
         lines.append(line(cells))
+    return "\n".join(lines)
+
+
+def bus_table(found: dict[str, dict[str, Any]]) -> str:
+    """From an insert to the estimate with it, by data set."""
+    names = ("p50", "p95", "p99", "max")
+    lines = [line(["insert to estimate, ms", "steps", *names]), line(["---", *["---:"] * (1 + len(names))])]
+    for dataset, seen in found.items():
+        if "insert_ms" in seen:
+            cells = [str(seen["steps"]), *(f"{seen['insert_ms'][name]:.2f}" for name in names)]
+        else:
+            cells = [seen["reason"], *[""] * len(names)]
+        lines.append(line([dataset, *cells]))
     return "\n".join(lines)
 
 

@@ -31,6 +31,7 @@ _MEASURES = {
     "cores": ("cores",),
     "full_pass": ("full_pass",),
     "overhead": ("overhead",),
+    "over_bus": ("over_bus",),
 }
 _GRACE_S = 600  # wall seconds on top of twice the limit, before a run that does not answer is ended
 Progress = Callable[[int, str], None]
