@@ -35,7 +35,17 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bench.replays import peer_summary, peer_table, peer_targets, problems, runner, summary, targets, world_targets
+from bench.replays import (
+    peer_summary,
+    peer_table,
+    peer_targets,
+    problems,
+    results_page,
+    runner,
+    summary,
+    targets,
+    world_targets,
+)
 from bench.replays.bars import Begin, Tell, bars
 from bench.replays.command import add_options, hand_out, positive
 from bench.replays.contestants import ENTRIES, ISAM2_NAMES, OURS, PEER, SKIPPING, STAND_INS, Entry
@@ -106,6 +116,8 @@ def main() -> None:
     document, verdicts = conclude(found, plan, [note, *absent])
     if not options.no_figures:
         document["figures"] = [str(path) for path in draw(options.out, found, document, plan)]
+    if options.page is not None:
+        options.page.write_text(results_page.page(document, sys.argv[1:]))
     hand_out("peers", document, peer_table.report(document, verdicts), options)
     if targets.missed(verdicts):
         sys.exit(1)
@@ -276,7 +288,7 @@ def _plan(options: argparse.Namespace, chosen: list[Problem]) -> tuple[Plan, lis
             f"({', '.join(p.name for p in chosen)}) or of the solvers ({', '.join(SOLVERS)})"
         )
     if not parts:
-        parts = ("replays",) if wanted or names else PARTS
+        parts = ("replays",) if wanted or names else tuple(p for p in PARTS if not (options.quick and p == "worlds"))
     entries = [ENTRIES[name] for name in names or (options.judge, PEER, SKIPPING)]
     absent = [f"Not measured: {entry.label} ({entry.missing()})." for entry in entries if entry.missing()]
     entries = [entry for entry in entries if not entry.missing()]
@@ -291,6 +303,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_options(parser, "peers", repetitions=None)
     parser.add_argument("--chi2-every", type=positive, default=1, metavar="N", help="look at χ² at each Nth step (1)")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="the page of results of the docs, to FILE")
     parser.add_argument("--seed", type=positive, default=secrets.randbelow(1 << 30) + 2, help="of worlds (drawn anew)")
     parser.add_argument("--judge", choices=OUR_MODES, default="auto", help="the mode that the targets are for")
     return parser.parse_args()

@@ -22,6 +22,7 @@ from bench.replays import (
     peer_summary,
     peer_table,
     peer_targets,
+    results_page,
     runner,
     world_targets,
 )
@@ -420,6 +421,29 @@ def test_an_unknown_name_is_refused_with_those_there_are() -> None:
     )
     assert ran.returncode == 1
     assert "--only intle: none of the parts (replays, worlds, bus, growth, cores, full-pass, overhead)" in ran.stderr
+
+
+def test_the_page_of_results_has_a_line_a_data_set_and_what_was_missed(tmp_path: Path) -> None:
+    entries, gave_up = ("auto", PEER, STAND_INS[PEER], SKIPPING), {"status": "failed", "reason": "step 150"}
+    at = {"versions": {"gtsam": "4.3.0"}, "measured_at": "2026-02-03T04:05:06Z", "chi2_settled": 10.0}
+    runs = {name: [a_run(name, seconds, **at)] for name, seconds in zip(entries, (1.0, 3.0, 7.0, 12.0), strict=True)}
+    runs[PEER] = [a_run(PEER, 3.0, 150, **at, **gave_up)]
+    rows = peer_summary.rows_of(Problem("intel", "Intel"), [ENTRIES[name] for name in entries], runs, BATCH)
+    document = {
+        "machine": {"cpu": "a processor", "cores": 2}, "rows": rows, "judged": "auto", "notes": ["a note"],
+        "over_bus": {"intel": {"insert_ms": {"p50": 0.41, "p99": 1.23}}},
+        "targets": [{"what": "w", "seen": "s", "verdict": MET}, {"what": "x", "seen": "y", "verdict": MISSED}],
+    }  # fmt: skip
+    text = results_page.page(document, ["--only", "intel", "--out", str(tmp_path), "--seed", "3"])
+    line = "| intel | 300 | 1 s | 7 s (7.0 ×) | 12 s (12.0 ×) | 0.10, 0.3 ms | 1.0000 | 1.0000 | 1.0000 | 0.4, 1.2 ms |"
+    assert line in text.splitlines()
+    assert (
+        "`factorbus bench peers --only intel --seed 3` found, on 2026-02-03, on one core: a processor (2 cores)" in text
+    )
+    assert "1 of 2 targets are met" in text
+    assert "- MISSED: x: y" in text
+    assert "> a note" in text
+    assert "Simulated worlds" not in text
 
 
 def world_rows(**more: float) -> tuple[list[dict[str, Any]], list[Problem]]:
