@@ -122,10 +122,8 @@ def prints_json(command: click.Command) -> bool:
 
 def test_the_table_of_extras_says_what_commands_ask_for() -> None:
     """In the source: `require("viz", "factorbus demo")`, or with an option that needs it."""
-    text = (ROOT / "README.md").read_text()
-    rows = dict(
-        re.findall(r"^\| `(\w+)` \| (.+) \|$", text[text.index("| extra |") : text.index("## What goes in")], re.M)
-    )
+    text = (ROOT / "docs" / "reference" / "commands.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", text[text.index("| extra |") :], re.M))
     asked = set()
     for path in (ROOT / "clients" / "factorbus" / "cli").rglob("*.py"):
         for extra, what in re.findall(r'require\("(\w+)", "([^"]+)"\)', path.read_text()):
@@ -138,6 +136,15 @@ def test_the_table_of_extras_says_what_commands_ask_for() -> None:
     missing = {(extra, command) for extra, command in asked if not known(extra, command)}
     # Options of `plot` that solve: the page of --help says so.
     assert missing <= {("service", "plot_source --solve"), ("service", "plot_source --ellipses of a file")}
+
+
+def test_numbers_beside_peers_are_those_of_the_page_that_the_bench_writes() -> None:
+    text = (ROOT / "README.md").read_text()
+    section = text[text.index("## Beside its peers") : text.index("## Commands")]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    page = (ROOT / "docs" / "choosing" / "results.md").read_text().splitlines()
+    assert len(lines) > 5
+    assert [line for line in lines if line not in page] == []
 
 
 def distance(said: str) -> float:
