@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,52 +11,33 @@ from typing import Any
 import numpy as np
 import pytest
 from bench import peers
+from bench.peer_runs import BATCH, a_run
 from bench.replays import (
     child,
     cores,
     full_pass,
     growth,
-    over_bus,
-    overhead,
     peer_summary,
     peer_table,
     peer_targets,
-    results_page,
     runner,
-    world_targets,
 )
 from bench.replays.columns import columns_of
 from bench.replays.contestants import ENTRIES, PEER, SKIPPING, STAND_INS
 from bench.replays.peer_targets import BARS
-from bench.replays.problems import ALL, Problem, drawn, load
+from bench.replays.problems import ALL, Problem, load
 from bench.replays.reference import optima
 from bench.replays.samples import Sampling
 from bench.replays.targets import MET, MISSED, NOT_MEASURED, Verdict
-from bench.replays.worlds import WORLDS
 from naive.cholmod import cholmod
 
-from factorbus.proto import codec
-from factorbus.proto.messages import Batch, Insert
-from factorbus.solver import Options, Solver, warm
+from factorbus.solver import Options, Solver
 
 PEERS = Path(__file__).parent / "peers.py"
 SILENT = lambda *_: None  # noqa: E731
 DIMS = {"se2": 3, "se3": 6, "point2": 2}
 RESIDUALS = {"between_se2": 3, "between_se3": 6, "landmark_se2": 2}
 ALWAYS = Sampling(every=1).as_json()
-
-
-def a_run(name: str, cpu_s: float = 1.0, done: int = 300, **more: Any) -> dict[str, Any]:
-    """Of 300 steps, of which the second half takes three quarters of the time."""
-    parts = {"p50": 0.1, "p95": 0.2, "p99": 0.3, "max": 0.4}
-    run: dict[str, Any] = dict.fromkeys(("solve_s", "read_s", "wall_s", "peak_mb", "base_mb", "load_average"), 1.0)
-    run |= {"contestant": name, "cpu_s": cpu_s, "done": done, "steps": 300, "status": "done", "reason": ""}
-    run |= {"step_ms": parts, "solve_ms": parts, "step_wall_ms": parts, "facts": {"nnz_r": 7}}
-    run |= {"cumulative": [[0, 149, 299], [0.0, 0.25 * cpu_s, cpu_s]], "chi2_settled": None}
-    return {**run, "chi2": [[99, 10.0], [199, 10.0], [299, 10.0]], **more}
-
-
-BATCH = {99: 10.0, 199: 10.0, 299: 10.0}
 
 
 def rows(ours: list[dict[str, Any]], peer: list[dict[str, Any]], name: str = "intel") -> list[dict[str, Any]]:
@@ -288,59 +268,6 @@ def test_a_pass_counts_only_against_openblas_and_with_the_same_solution() -> Non
     assert (crashed.verdict, crashed.seen) == (MISSED, "exit code 1")
 
 
-def test_time_inside_compiled_calls_is_part_of_the_step() -> None:
-    steps = load(Problem("manhattan", "Manhattan", poses=150, seed=1))
-    with overhead.timed_calls() as inside:
-        found = overhead.drive("auto", steps, inside)
-    for part in ("all", "odometry"):
-        row = found[part]
-        assert 0 < row["inside_us"] < row["total_us"]
-        assert 0 < row["outside_us"] < row["total_us"]
-    assert found["odometry"]["steps"] < found["all"]["steps"] == 150
-    assert not any(getattr(f, "__name__", "") == "call" for m in overhead.python_modules() for f in vars(m).values())
-
-
-def test_the_solvers_own_account_of_compiled_time_is_preferred() -> None:
-    class Report:
-        compiled_ms = 0.25
-
-    with overhead.timed_calls() as inside:
-        assert inside(Report()) == 0.25e-3
-
-
-def test_a_replay_over_the_bus_is_timed_by_the_robot() -> None:
-    found = over_bus.over_bus({}, Problem("manhattan", "Manhattan", poses=80, seed=3), SILENT)
-    assert found["steps"] == 80
-    assert 0 < found["insert_ms"]["p50"] <= found["insert_ms"]["p99"] <= found["insert_ms"]["max"]
-    assert "| intel | 80 |" in peer_table.bus_table({"intel": found})
-    assert "| intel | exit code 1 |" in peer_table.bus_table({"intel": {"status": "failed", "reason": "exit code 1"}})
-
-
-def test_a_start_compiles_nothing() -> None:
-    warm()
-    started = overhead.starts("auto")
-    assert started["compiled_s"] == 0.0
-    assert started["cpu_s"] > 0
-
-
-def an_overhead(**more: Any) -> list[str]:
-    step = {"by": "x", "all": {"steps": 9, "total_us": 30.0, "inside_us": 20.0, "outside_us": 14.0}}
-    step["odometry"] = {"steps": 4, "total_us": 20.0, "inside_us": 9.0, "outside_us": 10.0}
-    cold = {"cpu_s": 50.0, "wall_s": 51.0, "announced": ["a", "b", "c", "d"], "said": ""}
-    found = {"step": step, "start": {"cpu_s": 1.4, "wall_s": 3.0, "compiled_s": 0.0}, "cold": cold, **more}
-    assert "Python" in peer_table.overhead_list(found)
-    return [verdict.verdict for verdict in peer_targets.judge_overhead(found)]
-
-
-def test_bars_of_python_and_starting() -> None:
-    assert an_overhead() == [MET] * 4
-    assert an_overhead(cold=None) == [MET, MET, MET, NOT_MEASURED]
-    assert an_overhead(start={"cpu_s": 1.4, "wall_s": 1.4, "compiled_s": 0.2})[2] == MISSED
-    assert an_overhead(cold={"cpu_s": 50.0, "wall_s": 51.0, "announced": [], "said": ""})[3] == MISSED
-    slow = {"steps": 9, "total_us": 40.0, "inside_us": 11.0, "outside_us": 16.0}
-    assert an_overhead(step={"by": "x", "all": slow, "odometry": slow})[:2] == [MISSED, MISSED]
-
-
 def test_the_command_measures_prints_and_draws(tmp_path: Path) -> None:
     cholmod()
     pytest.importorskip("gtsam")
@@ -421,70 +348,3 @@ def test_an_unknown_name_is_refused_with_those_there_are() -> None:
     )
     assert ran.returncode == 1
     assert "--only intle: none of the parts (replays, worlds, bus, growth, cores, full-pass, overhead)" in ran.stderr
-
-
-def test_the_page_of_results_has_a_line_a_data_set_and_what_was_missed(tmp_path: Path) -> None:
-    entries, gave_up = ("auto", PEER, STAND_INS[PEER], SKIPPING), {"status": "failed", "reason": "step 150"}
-    at = {"versions": {"gtsam": "4.3.0"}, "measured_at": "2026-02-03T04:05:06Z", "chi2_settled": 10.0}
-    runs = {name: [a_run(name, seconds, **at)] for name, seconds in zip(entries, (1.0, 3.0, 7.0, 12.0), strict=True)}
-    runs[PEER] = [a_run(PEER, 3.0, 150, **at, **gave_up)]
-    rows = peer_summary.rows_of(Problem("intel", "Intel"), [ENTRIES[name] for name in entries], runs, BATCH)
-    document = {
-        "machine": {"cpu": "a processor", "cores": 2}, "rows": rows, "judged": "auto", "notes": ["a note"],
-        "over_bus": {"intel": {"insert_ms": {"p50": 0.41, "p99": 1.23}}},
-        "targets": [{"what": "w", "seen": "s", "verdict": MET}, {"what": "x", "seen": "y", "verdict": MISSED}],
-    }  # fmt: skip
-    text = results_page.page(document, ["--only", "intel", "--out", str(tmp_path), "--seed", "3"])
-    line = "| intel | 300 | 1 s | 7 s (7.0 ×) | 12 s (12.0 ×) | 0.10, 0.3 ms | 1.0000 | 1.0000 | 1.0000 | 0.4, 1.2 ms |"
-    assert line in text.splitlines()
-    assert (
-        "`factorbus bench peers --only intel --seed 3` found, on 2026-02-03, on one core: a processor (2 cores)" in text
-    )
-    assert "1 of 2 targets are met" in text
-    assert "- MISSED: x: y" in text
-    assert "> a note" in text
-    assert "Simulated worlds" not in text
-
-
-def world_rows(**more: float) -> tuple[list[dict[str, Any]], list[Problem]]:
-    """Of all worlds, ours eleven times as fast as iSAM2; more: by key, how much faster that is."""
-    worlds, found = drawn(77, 300), list[dict[str, Any]]()
-    for each in worlds:
-        peer = {name: [a_run(name, 11.0 * more.get(each.key, 1.0))] for name in (PEER, SKIPPING)}
-        runs = {"auto": [a_run("auto", chi2_settled=10.0)], **peer}
-        found += peer_summary.rows_of(each, [ENTRIES["auto"]], runs, BATCH)
-    return found, worlds
-
-
-def test_worlds_are_judged_by_half_and_by_how_far_the_halves_are_apart() -> None:
-    verdicts = world_targets.judge_worlds(*world_rows())
-    assert len(verdicts) == 7
-    assert {v.verdict for v in verdicts} == {MET}
-    drawn_here = {each.key: 0.8 for each in drawn(77, 300) if each.seed == 77}
-    missed = [v for v in world_targets.judge_worlds(*world_rows(**drawn_here)) if v.verdict == MISSED]
-    assert [v.seen for v in missed] == ["8.80, least 8.80 (manhattan-300-77)", "1.25 x"]
-    slow = [v for v in world_targets.judge_worlds(*world_rows(**{"torus-300-1": 0.26})) if v.verdict == MISSED]
-    assert [v.seen.split(", ")[1] for v in slow] == ["least 2.86 (torus-300-1)"] * 2
-    assert world_targets.judge_worlds([], []) == []
-
-
-@pytest.mark.parametrize("name", sorted(WORLDS))
-def test_a_world_is_drawn_from_its_seed_and_fits_its_truth(name: str) -> None:
-    first, again, other = (load(Problem(name, name, 130, None, seed)) for seed in (3, 3, 4))
-    assert messages(first) == messages(again) != messages(other)
-    assert len(first) == 130
-    solver = Solver(Options())
-    for batch in first:
-        solver.stage(batch)
-        solver.step()
-    solver.step(settle=True)
-    factors = [group for batch in first for group in batch.factors]
-    residuals = sum(RESIDUALS[group.kind] * len(group.keys) for group in factors)
-    variables = [group for batch in first for group in batch.variables if not group.fixed]
-    freedom = residuals - sum(DIMS[group.kind] * len(group.keys) for group in variables)
-    assert freedom > 20
-    assert abs(solver.chi2() - freedom) < 5.0 * np.sqrt(2.0 * freedom), "χ² of as many degrees of freedom"
-
-
-def messages(batches: Sequence[Batch]) -> list[bytes]:
-    return [codec.encode_insert(Insert(1, batch)) for batch in batches]

@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import pickle
 import re
 import types
 import typing
@@ -92,6 +93,18 @@ def test_what_was_seen_is_told_with_what_is_wanted_both_as_text(kind: type[Probl
         for name in {"seen", "wanted"} & set(problem.detail):
             assert isinstance(problem.detail[name], str), problem.detail
             assert problem.detail[name] in problem.message
+
+
+@pytest.mark.parametrize("kind", [*EVERY_KIND, UnsafeFolder, Refused], ids=lambda kind: kind.__qualname__)
+def test_it_goes_whole_to_another_process(kind: type[Problem] | type[SolverError]) -> None:
+    """As what a worker of a pool raises does."""
+    for problem in [Refused("odd", "some", {"where": "x1"})] if kind is Refused else made(kind):
+        if any(isinstance(value, types.SimpleNamespace) for value in vars(problem).values()):
+            continue  # a pending insert belongs to its session
+        again = pickle.loads(pickle.dumps(problem))
+        assert type(again) is type(problem)
+        assert (str(again), again.args) == (str(problem), problem.args)
+        assert (again.code, again.message, repr(again.detail)) == (problem.code, problem.message, repr(problem.detail))
 
 
 @pytest.mark.parametrize(("least", "wanted"), [(-1e12, "at most 1e+12 in magnitude"), (1e-24, "1e-24 to 1e+24")])

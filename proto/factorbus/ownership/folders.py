@@ -32,7 +32,11 @@ class UnsafeFolder(Exception):
     def __init__(self, what: str, path: Path, reason: str, mend: str) -> None:
         self.detail: dict[str, Any] = {"folder": str(path), "reason": reason}
         self.message = f"{what} {path} is not used: {reason}; {mend}"
+        self._arguments = what, path, reason, mend
         super().__init__(self.message)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return UnsafeFolder, self._arguments
 
 
 def check_folder(what: str, path: Path) -> None:

@@ -42,6 +42,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from factorbus.proto.nearest import nearest
+from factorbus.wording.picklable import Picklable
 
 Raised = TypeVar("Raised", bound=Exception)
 
@@ -49,7 +50,7 @@ _NAMED = 12  # maps named where one is asked for that is not there
 _FROM = {"values": "the map's own values", "odometry": "composed odometry", "rotations": "averaged rotations"}
 
 
-class Problem(Exception):
+class Problem(Picklable, Exception):
     """Base of everything that is answered instead of an answer."""
 
     code = "problem"

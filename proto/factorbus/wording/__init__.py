@@ -1,4 +1,4 @@
-"""How text for people is put together.
+"""How text for people is put together, and how an exception takes it from one process to another.
 
 Standard library alone, so that everything may import it.
 """

@@ -41,11 +41,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from factorbus.wording import counted
+from factorbus.wording.picklable import Picklable
 
 _INDEX_BITS = 56
 
 
-class SolverError(Exception):
+class SolverError(Picklable, Exception):
     """Base of everything the solver refuses.  Whatever was asked for has left no trace."""
 
     code = "solver_error"
