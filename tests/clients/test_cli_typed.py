@@ -54,6 +54,8 @@ def test_pictures_are_those_that_can_be_drawn() -> None:
         (["change", "weigh", "m", "-1", "3", *NOWHERE], "A number below 0 is written behind `--`"),
         (["change", "loss", "m", "foo", "1", "3", *NOWHERE], "changes: the loss 'foo'; wanted none, or one of huber"),
         (["change", "loss", "m", "dcs", "0", "3", *NOWHERE], "changes: the scale 0.0; wanted finite numbers above 0"),
+        (["ros2", "m", "--tolerance", "nan", *NOWHERE], "'nan' is not a finite number"),
+        (["ros2", "m", "--display", "-1", *NOWHERE], "-1.0 is not in the range"),
         (["bench"], "Missing argument"),
     ],
 )

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from faulty.service import MAP, Service, point, same
 from factorbus.client import Unavailable, connect
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Variables
-from factorbus.proto.problems import BadEndpoint, BadName, BadSetting, TooLarge, UnknownMap
+from factorbus.proto.problems import BadEndpoint, BadName, BadSetting, Refused, TooLarge, UnknownMap
 
 
 def test_nobody_there_is_said_within_the_time_given(endpoint: str) -> None:
@@ -42,6 +43,19 @@ def test_a_map_nobody_owns_is_unavailable(start: Callable[..., Service], endpoin
             _ = bus.map(MAP, mirror=False).estimate
         with pytest.raises(Unavailable, match=r"the mirror is stale"):
             bus.map(MAP)
+
+
+def test_a_map_that_comes_while_it_is_looked_for_is_not_its_own_correction(
+    start: Callable[..., Service], endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start()
+    with connect(endpoint, timeout_s=5) as bus:
+        found = bus.maps()
+        monkeypatch.setattr(bus, "maps", lambda _timeout_s: [replace(row, name="attic") for row in found])
+        with pytest.raises(Refused) as caught:
+            bus.map("attic", create=False)
+    assert caught.value.code == "unknown_map"
+    assert "did you mean" not in caught.value.message
 
 
 @pytest.mark.parametrize("bad", ["127.0.0.1:7447", "", "tcp", "tcp/"])

@@ -215,6 +215,11 @@ def test_options_arrive() -> None:
         bridge_settings(replace(options, letter="B"))
     with pytest.raises(BadRosName, match="--space"):
         bridge_settings(replace(options, space=False))
+    with pytest.raises(BadRosName, match="one for each of --tf and --tf-raw"):
+        bridge_settings(replace(options, tf_raw="/tf"))
+    with pytest.raises(BadRosName, match="--smooth-s with it"):
+        bridge_settings(replace(options, smooth_s=0.0))
+    assert bridge_settings(replace(options, smooth_s=0.0, tf_raw=Settings().raw_transforms)).smooth_s == 0.0
 
 
 @pytest.mark.parametrize("space", ["plane", "space"])

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from factorbus.proto.problems import BadName
 from factorbus.service.config import BadConfig, Config, Limits, checked_config, load_config
 
 
@@ -45,6 +46,8 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
         ('mode = "client"', "nothing to connect to"),
         ('upstream = "tcp/base:7447"', "upstream without a journal"),
         ('upstream_zenoh = "robot.json5"', "without an upstream"),
+        ('upstream = "tcp/127.0.0.1:7447"\njournal = "j"', "where this service listens"),
+        ('upstream = "tcp/localhost:7448"\njournal = "j"\nlisten = ["tcp/0.0.0.0:7448"]', "where this service listens"),
         ("listen = []", "nothing to listen on"),
         ('maps = "a/*"', "wanted a map name"),
         ("job_deadline_s = -1", "wanted more than 0"),
@@ -58,6 +61,11 @@ def test_what_cannot_be_is_named(tmp_path: Path, text: str, wanted: str) -> None
     path.write_text(text)
     with pytest.raises(BadConfig, match=wanted):
         load_config(path)
+
+
+def test_the_name_of_a_service_is_looked_at_before_its_maps_are_opened() -> None:
+    with pytest.raises(BadName, match="service name 'a b' will not do"):
+        checked_config(replace(Config(), name="a b"))
 
 
 def test_the_defaults_can_work() -> None:

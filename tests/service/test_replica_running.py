@@ -217,3 +217,30 @@ def test_what_a_map_that_is_gone_had_asked_is_not_gone_on_with(ends: tuple[End, 
     finally:
         replicas.close()
     assert isinstance(base.insert("tablet", pose("y", 0)), object)
+
+
+def test_how_far_an_upstream_made_anew_is_behind(ends: tuple[End, End], tmp_path: Path) -> None:
+    """It has nothing of what the one before had, so all of it is to be sent once more."""
+    robot, base = ends
+    drive(robot, "x", 0, 5)
+    anew, said = End(tmp_path / "anew"), list[int]()
+    played = Played(base)
+    try:
+        with Following(robot, played) as following:
+
+            def behind() -> int:
+                return following.replicas.row("m")["upstream"]["behind"]
+
+            following.until(lambda: level(robot, base)() and behind() == 0)
+            ask = played.ask
+
+            def heard(key: str, payload: bytes, timeout_s: float, done: Done) -> None:
+                if key.endswith("/robot1"):
+                    said.append(behind())
+                ask(key, payload, timeout_s, done)
+
+            played.base, played.ask = anew, heard  # type: ignore[method-assign]
+            following.until(lambda: level(robot, anew)() and behind() == 0)
+        assert said[0] == 5, "before the first of it is sent"
+    finally:
+        anew.close()

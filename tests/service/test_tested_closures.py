@@ -131,6 +131,29 @@ def test_changes_of_closures_that_are_out() -> None:
     made.kill()
 
 
+def test_a_closure_in_the_estimate_that_one_insert_asks_two_things_of_is_named_twice() -> None:
+    made = driven()
+    made.insert(Batch((), (right(1, LENGTH),)))
+    before = made.states()
+    assert before == {16: "accepted"}
+    weigh, loss = (
+        Change("weigh", ids(16), weight=np.full(1, 0.5)),
+        Change("loss", ids(16), loss="dcs", scale=np.ones(1)),
+    )
+    for changes in (
+        (Change("remove_factors", ids(3, 16)), Change("accept", ids(16))),
+        (Change("remove_factors", ids(16)), Change("reject", ids(16))),
+        (weigh, Change("reject", ids(16))),
+        (Change("reject", ids(16)), loss),
+    ):
+        refused = made.change(*changes)
+        assert (refused.code, refused.detail["factor"]) == ("named_twice", 16), changes
+    assert (made.states(), 16 in made.in_graph()) == (before, True)
+    made.change(weigh, Change("accept", ids(16)))
+    assert made.states() == {16: "restored"}
+    made.kill()
+
+
 def test_a_loss_of_a_closure_goes_out_and_comes_back_with_it() -> None:
     made = driven()
     made.insert(Batch((), (right(1, LENGTH),)))

@@ -240,7 +240,8 @@ class Bus:
         if refused.code != UnknownMap.code:
             return refused
         try:
-            return UnknownMap(name, [row.name for row in self.maps(min(self.timeout_s, _LIST_S))])
+            names = [row.name for row in self.maps(min(self.timeout_s, _LIST_S))]
+            return refused if name in names else UnknownMap(name, names)  # it may have come since
         except Problem:
             return UnknownMap(name)
 

@@ -93,6 +93,12 @@ class Settings:
 
 def bridge_settings(options: BridgeOptions) -> Settings:
     """Of a bridge.  Raises BadRosName, BadSymbol."""
+    if options.tf_raw == options.tf:
+        raise BadRosName("the topic", options.tf_raw, "one for each of --tf and --tf-raw: both are map to odometry")
+    if not options.smooth_s and options.tf_raw != Settings().raw_transforms:
+        raise BadRosName(
+            "--tf-raw", options.tf_raw, "--smooth-s with it: without, --tf has transforms as the map has them"
+        )
     given = robot_settings(options)
     # Without these options the usual topics are read.
     return replace(

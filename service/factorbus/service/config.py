@@ -15,6 +15,7 @@ from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import MessageLimits
 from factorbus.proto.problems import Problem
 
+_THIS_HOST = ("127.0.0.1", "localhost", "[::1]", "0.0.0.0", "[::]")
 _HOST_PORT = re.compile(r"(?:\[[0-9a-fA-F:]+\]|[^\s:/]+):\d{1,5}")
 # Limits for which 0 means: find it out.
 _MAY_BE_0 = ("memory_bytes",)
@@ -121,6 +122,8 @@ def checked_config(config: Config) -> Config:
         checked_endpoint(endpoint)
     for name in config.create:
         checked_name("map", name)
+    if config.name:
+        checked_name("service", config.name)
     if config.mode not in ("peer", "router", "client"):
         raise BadConfig(f"mode is {config.mode!r}; wanted peer, router or client")
     if config.mode == "client" and not config.connect:
@@ -150,6 +153,14 @@ def checked_config(config: Config) -> Config:
         raise BadConfig("standby without a journal: there is nothing to take over; give journal = DIR")
     if config.upstream and not config.journal:
         raise BadConfig("upstream without a journal: what upstream does not have yet is kept in it; give journal = DIR")
+    if (
+        config.upstream
+        and config.mode != "client"
+        and _at_this_host(config.upstream) in map(_at_this_host, config.listen)
+    ):
+        raise BadConfig(
+            f"upstream is {config.upstream}, where this service listens: that is itself; give another one's"
+        )
     if config.upstream_zenoh and not config.upstream:
         raise BadConfig('upstream_zenoh without an upstream; give upstream = "tcp/HOST:7447"')
     usual = Config()
@@ -160,6 +171,13 @@ def checked_config(config: Config) -> Config:
     if not config.maps or not all(c.isalnum() or c in "_-" for c in stem) or not stem.isascii():
         raise BadConfig(f"maps is {config.maps!r}; wanted a map name or the beginning of one and a *, such as site7-*")
     return config
+
+
+def _at_this_host(endpoint: str) -> str:
+    """`endpoint`, with one name for this host."""
+    address = endpoint.partition("/")[2]
+    host, _, port = address.rpartition(":")
+    return port if host in _THIS_HOST else address
 
 
 def needs_journal(name: str) -> BadConfig:

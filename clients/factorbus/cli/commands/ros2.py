@@ -67,14 +67,18 @@ class NodeOptions:
     "--pose-out", default="/factorbus/pose", show_default=True, metavar="TOPIC",
     help="Where geometry_msgs/PoseWithCovarianceStamped of the last keyframe goes.",
 )  # fmt: skip
-@click.option("--tolerance", default=0.1, show_default=True, metavar="SECONDS", help="Transforms are stamped ahead.")
+@click.option(
+    "--tolerance", type=SECONDS, default=0.1, show_default=True, metavar="SECONDS", help="Transforms are stamped ahead."
+)
 @click.option(
     "--services/--no-services", default=True, show_default=True, help="settle, save, fork, repair, as Trigger."
 )
 @click.option(
     "--save-folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Where the service saves."
 )
-@click.option("--display", default=1.0, show_default=True, metavar="SECONDS", help="Least time between paths.")
+@click.option(
+    "--display", type=SECONDS, default=1.0, show_default=True, metavar="SECONDS", help="Least time between paths."
+)
 @zenoh_option
 @log_option
 @click.option("--quiet", is_flag=True, help="Log warnings only.")

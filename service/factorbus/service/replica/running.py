@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple, Protocol
 
-from factorbus.journal.problems import JournalDamaged, JournalUnreadable
+from factorbus.journal.problems import JournalDamaged
 from factorbus.journal.records import JournalRecord
 from factorbus.journal.rewriting import UpstreamPlace, upstream_of
 from factorbus.journal.store import open_store
@@ -223,26 +223,16 @@ class Replicas:
         # Set first: what is written from here on is heard of, if only when this has been done.
         keeper.written = lambda records: self._events.put(lambda: self._wrote(name, keeper, records))
         try:
-            store = open_store(keeper.folder, read_only=True)
+            place, last = _place_of(keeper), keeper.last
+            if place.record > last.record:  # the end of the journal was lost in a crash
+                place = UpstreamPlace(*JournalPlace())
+            followed = _Followed(host, keeper, UpstreamCore(JournalPlace(*place), last.record, time.monotonic()))
+            followed.behind = followed.tail.inserts(place.record, last.record)
         except Problem as problem:
             self._cannot_follow(name, problem)
             return
-        try:
-            place, last = upstream_of(store), keeper.last
-            if place.record > last.record:  # the end of the journal was lost in a crash
-                place = UpstreamPlace(*JournalPlace())
-            # The journal may have grown since: of what is newer `_wrote` will hear.
-            own = islice(store.records(place.record), last.record - place.record)
-            behind = sum(count_inserts(record.entries) for record in own)
-        except (JournalDamaged, JournalUnreadable) as problem:
-            self._cannot_follow(name, problem)
-            return
-        finally:
-            store.close()
         keeper.upstream = place
         host.upstream_stats = lambda: self.row(name)
-        followed = _Followed(host, keeper, UpstreamCore(JournalPlace(*place), last.record, time.monotonic()))
-        followed.behind = behind
         self._maps[name] = followed
         self._unfollowed.pop(name, None)
         if self._alive:
@@ -341,7 +331,10 @@ class Replicas:
         if isinstance(result, Problem):
             if result.code not in ("records_moved_on", "busy"):
                 followed.say("map %s: upstream %s: %s", followed.host.core.name, self._endpoint, result)
+            before = core.place.record
             self._do(followed, core.refused(number, result, now))
+            if core.place.record < before:  # upstream is another one since, and has less of it
+                followed.behind = followed.tail.inserts(core.place.record, core.head)
             return
         if not isinstance(result, bytes):
             self._do(followed, core.silent(number, result is False, now))
@@ -395,3 +388,12 @@ class Replicas:
                 followed.host.core.name,
             )
         followed.same_bits = same
+
+
+def _place_of(keeper: Keeper) -> UpstreamPlace:
+    """The last one that both were known to have, when the journal was written.  Raises JournalUnreadable."""
+    store = open_store(keeper.folder, read_only=True)
+    try:
+        return upstream_of(store)
+    finally:
+        store.close()

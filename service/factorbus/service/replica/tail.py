@@ -2,10 +2,11 @@
 
 from collections import deque
 from collections.abc import Sequence
-from itertools import islice
+from itertools import islice, takewhile
 
 from factorbus.journal.records import JournalRecord
 from factorbus.journal.store import open_store
+from factorbus.proto.closures import count_inserts
 from factorbus.service.journal.keeping import Keeper
 
 _MOST_RECORDS, _MOST_BYTES = 4096, 4 << 20
@@ -40,6 +41,15 @@ class JournalTail:
             self.forget()
             self._read(record)
         return list(self._records)
+
+    def inserts(self, after: int, until: int) -> int:
+        """How many of clients are behind record `after`, up to `until`.  Raises JournalDamaged, JournalUnreadable."""
+        store = open_store(self._keeper.folder, read_only=True)
+        try:
+            records = takewhile(lambda record: record.number <= until, store.records(after))
+            return sum(count_inserts(record.entries) for record in records)
+        finally:
+            store.close()
 
     def _read(self, record: int) -> None:
         store = open_store(self._keeper.folder, read_only=True)

@@ -46,8 +46,8 @@ def asked_changes(ledger: ClosureLedger, insert: Arrived, content: Insert) -> As
         if not out or len(out) < len(ids):
             left.append(change._replace(factors=np.array([i for i in ids if i not in gone])) if out else change)
     verdicts = _together(said)
-    _check_once("accept, reject and remove_factors", [*verdicts.factors.tolist(), *gone])
     switch = planned_switch(ledger, verdicts)
+    _check_apart(verdicts, switch, gone, left)
     removals = [Change("remove_factors", removal.factors) for removal in switch.removals]
     batch: Any = content.batch._replace(factors=(*content.batch.factors, *switch.additions))
     made = content._replace(batch=batch, changes=(*removals, *left))
@@ -65,8 +65,25 @@ def _together(said: Sequence[ClosureVerdicts]) -> ClosureVerdicts:
     )  # fmt: skip
 
 
+def _check_apart(verdicts: ClosureVerdicts, switch: ClosureSwitch, gone: set[int], left: Sequence[Change]) -> None:
+    """No closure is removed and accepted or rejected in one insert, and none that goes out is edited in it.
+
+    Raises NamedTwice.
+    """
+    said = verdicts.factors.tolist()
+    _check_once("accept, reject and remove_factors", [*said, *gone])
+    goes = {closure.factor_id for closure in switch.out}
+    for change in left:
+        ids = set() if change.factors is None else set(change.factors.tolist())
+        removes = change.change == "remove_factors"
+        what = "accept, reject and remove_factors" if removes else f"reject and {change.change}"
+        _check_once(what, [*said, *ids.intersection(said if removes else goes)])
+
+
 def _check_once(what: str, factors: Sequence[int]) -> None:
     """Raises NamedTwice."""
-    for k, factor in enumerate(factors):
-        if factor in factors[:k]:
+    known = set[int]()
+    for factor in factors:
+        if factor in known:
             raise NamedTwice(what, f"factor {factor}", factor=factor)
+        known.add(factor)
