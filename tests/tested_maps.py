@@ -102,6 +102,16 @@ class TestedMap:
         assert self.content() == held
         assert self.solver.suspects(True) == before
 
+    def go_back(self) -> None:
+        """Apply all records anew without the verdicts, as where a replica puts its own behind others'."""
+        own, self.records, self.last = self.records, [], Last(0, 0, chain.START)
+        self.solver = new_solver()
+        for record in own:
+            inserts = [arrived_again(entry) for entry in record.entries if entry.client != JUDGE]
+            made = written(self.last.record + 1, inserts, list(self.solver.apply_again(inserts)), self.last)
+            self.records.append(made)
+            self.last = Last(made.number, made.revision, made.chain)
+
     def content(self) -> list[bytes]:
         """Every number of the estimate and of its factors, with their ids."""
         variables, factors = self.solver.solver.graph()

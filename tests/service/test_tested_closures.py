@@ -97,6 +97,27 @@ def test_a_journal_is_run_again_by_its_verdicts_and_not_by_judging(monkeypatch: 
     assert made.states() == {16: "accepted", 17: "suspect"}
 
 
+def test_closures_that_came_without_verdicts_are_judged_with_the_next_insert_whatever_it_is() -> None:
+    made = driven()
+    made.insert(Batch((), (right(1, LENGTH), right(4, LENGTH), between(2, 15, [3.0, 0.0, 3.14]))))
+    before = made.states()
+    assert before == {16: "accepted", 17: "accepted", 18: "suspect"}
+    made.go_back()
+    assert set(made.suspects().reasons) == {"new"}
+    made.kill()
+    made.insert(Batch((Variables("se2", np.array([900])),), (between(15, 900, [1.0, 0.0, 0.0], trusted=True),)))
+    assert made.states() == before
+    assert "new" not in made.suspects().reasons
+    judged = made.judged()
+    made.insert(Batch())
+    assert made.judged() == judged, "once"
+    made.kill()
+    made.go_back()
+    for further in (False, True):  # nothing but a graft, or a step with nothing new
+        made.solver.apply_whole([], further)
+        assert set(made.suspects().reasons) == {"new"}, "without an insert the journal has no place for verdicts"
+
+
 def test_what_a_user_says_stays_whatever_comes() -> None:
     made = driven()
     made.insert(Batch((), (right(1, LENGTH), between(2, 15, [3.0, 0.0, 3.14]))))

@@ -209,6 +209,18 @@ def test_what_is_left_is_a_bound_of_what_there_is_to_gain() -> None:
         assert report.unsolved >= 0.9 * (report.chi2 - optimum)
 
 
+def test_by_how_much_a_torn_estimate_is_above_its_optimum() -> None:
+    solver, whole, torn = Solver(Options(step_budget=2.3e7)), Solver(), 0
+    for step in manhattan(1160, seed=3):
+        for each in (solver, whole):
+            each.stage(step.batch)
+        report, optimum = solver.step(), whole.step().chi2
+        if report.chi2 > optimum + 1.0:
+            torn += 1
+            assert report.unsolved >= 0.9 * (report.chi2 - optimum)
+    assert torn > 20
+
+
 def test_a_step_that_settles_has_no_budget() -> None:
     batches = list(WORLDS["streets"](9))
     solver = Solver(Options(step_budget=1.0))

@@ -10,6 +10,7 @@ from naive.dense_factors import pose_matrix
 from two_maps import SEEN, Candidate, Drive, two_drives
 
 from factorbus.client import AmbiguousAlignment, CannotMerge, Draft, Map, NotAligned, align, connect
+from factorbus.client.aligning import _two_digits
 
 LETTERS = {"x": "y"}
 KIND, SIGMAS = "se2", SEEN["se2"].tolist()
@@ -95,7 +96,7 @@ def test_what_is_ambiguous_or_too_little_is_not_merged(endpoint: str) -> None:
             found.anchors()
         assert refused.value.code == "ambiguous_alignment"
         few = align(hall, yard, drafted(candidates[:1]), letters=LETTERS)
-        assert (few.verdict, few.frame, str(few)) == ("too_few", None, "no two of 1 candidate agree")
+        assert (few.verdict, few.frame, str(few)) == ("too_few", None, "1 candidate, and none that it could agree with")
         with pytest.raises(NotAligned):
             few.anchors()
         before = hall.estimate.revision
@@ -104,6 +105,7 @@ def test_what_is_ambiguous_or_too_little_is_not_merged(endpoint: str) -> None:
             (Draft().se2("y900").between_se2("x0", "y900", (0, 0, 0), sigmas=SIGMAS), "se2"),
             (Draft().prior_se2("x0", (0, 0, 0), sigmas=SIGMAS), "prior_se2"),
             (Draft().between_se2("x0", "y900", (0, 0, 0), sigmas=SIGMAS), "names y900, which neither map has"),
+            (Draft().between_se3("x0", "y1", (0, 0, 0, 0, 0, 0, 1), sigmas=(0.1,) * 6), "x0 and y1, .* of kind se3"),
             (Draft().between_se2("x0", "x1", (0, 0, 0), sigmas=SIGMAS), "two poses of one map"),
             (Draft().between_se2("x0", "y1", (0, 0, 0), information=np.diag([1.0, 1, 0])), "between x0, y1 is no rel"),
             (Draft().between_se2("x0", "y1", (0, 0, 0), sigmas=(1e100, 1, 1)), "between x0, y1 is no rel"),
@@ -113,6 +115,10 @@ def test_what_is_ambiguous_or_too_little_is_not_merged(endpoint: str) -> None:
         with pytest.raises(CannotMerge, match="both maps have x0 and x1"):
             align(hall, yard, Draft().between_se2("x0", "x1", (0, 0, 0), sigmas=SIGMAS))
         assert hall.estimate.revision == before
+
+
+def test_a_large_distance_is_said_without_an_exponent() -> None:
+    assert [_two_digits(number) for number in (0.0123, 1.26, 99.4, 99.6, 174.0)] == ["0.012", "1.3", "99", "100", "174"]
 
 
 def command(endpoint: str, *rest: str) -> subprocess.CompletedProcess[str]:

@@ -115,7 +115,7 @@ def align(
     kind = _kind_of(given)
     known_here = _poses(here.ask_estimate(timeout_s=timeout_s), {}, kind)
     known_there = _poses(other.ask_estimate(timeout_s=timeout_s), named, kind)
-    ends = [_ends(pair, known_here, known_there) for group in given.factors for pair in group.keys.tolist()]
+    ends = [_ends(kind, pair, known_here, known_there) for group in given.factors for pair in group.keys.tolist()]
     of_a, of_b = [known_here[a] for a, *_ in ends], [known_there[b] for _, b, _ in ends]
     z, noise = _measured(given, kind, np.array([turned for *_, turned in ends]))
     kept = _first_of_each(ends, z, noise)
@@ -156,7 +156,7 @@ def _poses(of: Estimate, letters: Mapping[str, str], kind: str) -> dict[int, tup
 
 
 def _ends(
-    pair: list[int], here: Mapping[int, tuple[int, F64]], there: Mapping[int, tuple[int, F64]]
+    kind: str, pair: list[int], here: Mapping[int, tuple[int, F64]], there: Mapping[int, tuple[int, F64]]
 ) -> tuple[int, int, bool]:
     """The pose here, the one there, and whether the candidate names that one first.  Raises CannotMerge."""
     a, b = pair
@@ -170,7 +170,7 @@ def _ends(
     if b in here and a in there:
         return b, a, True
     missing = " and ".join(format_symbol(key) for key in pair if key not in here and key not in there)
-    why = f"{missing}, which neither map has as a pose" if missing else "two poses of one map"
+    why = f"{missing}, which neither map has as a pose of kind {kind}" if missing else "two poses of one map"
     raise CannotMerge(
         f"a candidate names {why} ({format_symbol(a)}, {format_symbol(b)}); wanted a pose of each map, the other's "
         "under its new key"
@@ -249,7 +249,7 @@ def _sentence(found: Judgement, count: int) -> str:
     """The verdict with its numbers."""
     best, rival = found.best, found.rival
     if best is None:
-        return f"no two of {counted(count, 'candidate')} agree"
+        return f"no two of {count} candidates agree" if count > 1 else "1 candidate, and none that it could agree with"
     place, turn = best.sigmas()
     said = f"{best.members.size} of {count} agree, σ {place:.2g} m and {math.degrees(turn):.2g}°"
     if found.verdict == TOO_FEW:
@@ -258,10 +258,15 @@ def _sentence(found: Judgement, count: int) -> str:
     if rival is None:
         return f"{said}; no two of the others do"
     apart, turned = gap_between(best.T, rival.T)
-    where = f"{apart:.2g} m and {math.degrees(turned):.2g}° from there"
+    where = f"{_two_digits(apart)} m and {_two_digits(math.degrees(turned))}° from there"
     if found.verdict == AMBIGUOUS:
         return f"{said}; ambiguous with a second set of {rival.members.size}, {where}"
     return f"{said}; the largest set of the others has {rival.members.size}, {where}"
+
+
+def _two_digits(number: float) -> str:
+    """Without an exponent where it is large: 0.012, 1.2, 12, 123."""
+    return f"{number:.0f}" if number >= 99.5 else f"{number:.2g}"
 
 
 def _numbered(batch: Batch) -> list[tuple[Factors, I64]]:

@@ -300,7 +300,8 @@ class UnknownFactor(SolverError):
     code = "unknown_factor"
 
     def __init__(self, factor: int, following: int) -> None:
-        seen = "it has been removed" if 0 <= factor < following else f"the next one will be {following}"
+        gone = "it has been removed, or is a loop closure that the estimate does not have, as ask/suspects says"
+        seen = gone if 0 <= factor < following else f"the next one will be {following}"
         super().__init__(
             f"there is no factor {factor}: {seen}; ids are in the answer to an insert, and in the graph of the map",
             factor=factor,

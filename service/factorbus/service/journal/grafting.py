@@ -187,7 +187,7 @@ class _Grafting:
         ids = [entry.first_factor for record in own for entry in record.entries if entry.first_factor >= 0]
         first, moved = min(ids, default=0), False
         for record in own:
-            # Verdicts on closures are of the map as it was: what is new here is judged with the next closure.
+            # Verdicts on closures are of the map as it was: what is new here is judged with the next insert.
             own_inserts = [entry for entry in record.entries if entry.client != JUDGE]
             entries = [entry for entry in own_inserts if not self._is_there(entry, there)]
             if not entries and not record.further:

@@ -41,7 +41,7 @@ from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.asked import AskedChanges, asked_changes
 from factorbus.solver.closures.ahead import StagedBatch, enter_closures, stage_with_believed
 from factorbus.solver.closures.judging import ClosureJudge
-from factorbus.solver.closures.ledger import NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts
+from factorbus.solver.closures.ledger import NEW, NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.closures.loops import SplitFactors, TrustedForest, has_candidates
 from factorbus.solver.closures.switching import note_switch, planned_switch
 from factorbus.solver.errors import SolverError
@@ -73,9 +73,13 @@ class TestedMapSolver(MapSolver):
         self._testing: _Testing | None = None
         self._begin_anew()
 
+    def _has_new(self) -> bool:
+        return any(ledger.unjudged().size for ledger in self._ledger.of_kind.values())
+
     def _begin_anew(self) -> None:
         self._ledger, self._forest = ClosureLedger(), TrustedForest()
         self._entries = 0  # verdicts that were entered since
+        self._left_new = False  # closures came without verdicts on them, as those of a replica that went back
 
     # ---- as of any map solver ---------------------------------------------------------------------------------------
 
@@ -87,12 +91,14 @@ class TestedMapSolver(MapSolver):
         try:
             yield from super().apply_again(inserts, rebuilt, further)
         finally:
-            self._replaying = False
+            self._replaying, self._left_new = False, self._has_new()
 
     def apply_batch(
         self, inserts: Sequence[Arrived], further: bool
     ) -> SingleInsertResult | Iterator[Verdict | Stepped | Applied]:
         """As of any map; an insert with what may be a closure is never done in one go."""
+        if self._left_new and inserts:
+            return self.apply(inserts)
         if further or len(inserts) != 1 or inserts[0].is_change or getattr(inserts[0].content, "convert_below", 0.0):
             return super().apply_batch(inserts, further)
         batch = _batch_of(inserts[0])
@@ -125,6 +131,9 @@ class TestedMapSolver(MapSolver):
             else:
                 yield from self._change_tested(insert)
         yield from self._add_plain(plain)
+        if inserts and self._left_new and not self._replaying:
+            self._left_new = False
+            yield from self._judged([c for c in self._ledger.closures if c.reason == NEW])
         yield self._applied(cpu_s)
 
     def dump(self) -> dict[str, Any]:
@@ -139,6 +148,7 @@ class TestedMapSolver(MapSolver):
             own = state["closures"]
             self._ledger.load(own["ledger"], self._solver.factor_graph)
             self._forest.load(own["forest"])
+            self._left_new = self._has_new()
         return same
 
     def closure_counts(self) -> dict[str, int]:

@@ -140,5 +140,6 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
         state[tl.S_AFTER] += tl.ROSE
     if state[tl.S_RAISED] != 0:
         state[tl.S_AFTER] += tl.RAISED
-    if state[tl.S_AFTER] == 0:
+    # χ² of a torn estimate is above the optimum by more than what the errors of the factors come to.
+    if state[tl.S_AFTER] == 0 and state[tl.S_BEHIND] == 0:
         totals[tl.T_LEAST] = max(chi2 - left(totals), 0.0)
