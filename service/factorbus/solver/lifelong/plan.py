@@ -23,13 +23,15 @@ from factorbus.solver.lifelong.redundant import Redundant, find_redundant
 from factorbus.solver.lifelong.relative_terms import RelativeTerm, factor_of_term, term_of_factors, turned_term
 
 _GROUP, _NEIGHBOURS = 16, 20  # poses that are taken out at once, and what these may hang together with
+_LOOKED_AT = 4  # times as many as are to go: the newest, which hang together
 _NONE = np.empty(0, np.int64)
 
 
 class KeepPlan(NamedTuple):
     """keys (n,): of poses that go; factors (m,): ids of those that go; added: what takes their place.
 
-    loss: what is lost with all of them, nats.  left: poses that are redundant, and cannot go or would lose too much.
+    loss: what is lost with all of them, nats.  left: redundant poses that cannot go or would lose too much, of those
+    that were looked at: of all, where nothing goes.
     """
 
     keys: I64
@@ -44,24 +46,39 @@ def plan_removals(graph: FactorGraph, policy: KeepPolicy, most: int = 64, stayin
 
     staying: keys of poses that stay.  After it, there may be more.
     """
-    found = find_redundant(graph, policy, staying)
-    if not found.poses.size:
-        return KeepPlan(_NONE, _NONE, [], 0.0, 0)
-    at_work = _Planning(graph, policy, found)
-    for pose in found.poses.tolist():
-        if len(at_work.taken) >= most:
-            break
-        at_work.take_group(pose)
-    merged, added = _merged(graph, at_work.terms, at_work.on)
-    factors = graph.ids_of(np.array(sorted(at_work.rows | merged), np.int64))
-    return KeepPlan(graph.keys[np.array(at_work.taken, np.int64)], factors, added, at_work.loss, at_work.left)
+    found, left = find_redundant(graph, policy, staying), 0
+    for first in range(0, found.poses.size, _LOOKED_AT * most):
+        poses = found.poses[first : first + _LOOKED_AT * most]
+        at_work = _Planning(graph, policy, _around(found, poses, int(graph.counts[at.VARIABLES])))
+        for pose in at_work.poses:
+            if len(at_work.taken) >= most:
+                break
+            at_work.take_group(pose)
+        left += at_work.left
+        if at_work.taken:
+            merged, added = _merged(graph, at_work.terms, at_work.on)
+            factors = graph.ids_of(np.array(sorted(at_work.rows | merged), np.int64))
+            return KeepPlan(graph.keys[np.array(at_work.taken, np.int64)], factors, added, at_work.loss, left)
+    return KeepPlan(_NONE, _NONE, [], 0.0, left)
+
+
+def _around(found: Redundant, poses: I64, variables: int) -> Redundant:
+    """Of these poses alone, and of their neighbours: with the factors that any of them has."""
+    near = np.zeros(variables, bool)
+    near[poses] = True
+    near[found.ends[near[found.ends].any(axis=1)]] = True
+    rows = near[found.ends].any(axis=1)
+    return Redundant(poses, found.rows[rows], found.ends[rows])
 
 
 class _Planning:
-    """One plan at work.  taken: poses; touched: their neighbours; rows: of their factors; terms: by pair."""
+    """One plan at work.  poses: those with the fewest neighbours first.  taken: of these; rows: of their factors.
+
+    terms: what takes their place, by pair of neighbours.
+    """
 
     def __init__(self, graph: FactorGraph, policy: KeepPolicy, found: Redundant) -> None:
-        self.taken, self.touched, self.rows = list[int](), set[int](), set[int]()
+        self.taken, self.rows = list[int](), set[int]()
         self.terms: dict[tuple[int, int], list[RelativeTerm]] = {}
         self.loss, self.left = 0.0, 0
         self.on: dict[int, dict[int, list[int]]] = {}  # rows by variable and its neighbour
@@ -70,6 +87,7 @@ class _Planning:
         for row, (i, j) in zip(found.rows.tolist(), found.ends.tolist(), strict=True):
             self.on.setdefault(i, {}).setdefault(j, []).append(row)
             self.on.setdefault(j, {}).setdefault(i, []).append(row)
+        self.poses: list[int] = sorted(found.poses.tolist(), key=lambda pose: len(self.on.get(pose, ())))
 
     def take_group(self, pose: int) -> None:
         """The pose, with redundant ones around it; or alone, where they lose too much together; or not at all."""

@@ -23,7 +23,7 @@ _SEEN = [at.FACTOR_CODES[name] for name in ("landmark_se2", "landmark_se3")]
 
 
 class Redundant(NamedTuple):
-    """poses (n,): variables, those with the fewest neighbours first.
+    """poses (n,): variables, the newest first.
 
     rows (m,): of relative factors between what is estimated; ends (m, 2): their variables.
     """
@@ -50,9 +50,7 @@ def find_redundant(graph: FactorGraph, policy: KeepPolicy, staying: I64) -> Redu
     poses = poses[~_newest(graph.keys[poses] >> 56, policy.window)]
     found = _surplus(_places(graph, poses), may_go[poses], policy)
     rows = np.flatnonzero(relative)
-    neighbours = np.bincount(ends[rows].ravel(), minlength=n)
-    picked = poses[found]
-    return Redundant(picked[np.lexsort((-picked, neighbours[picked]))], rows, ends[rows])
+    return Redundant(np.sort(poses[found])[::-1], rows, ends[rows])
 
 
 def _newest(letters: I64, window: int) -> np.ndarray:
@@ -73,12 +71,13 @@ def _surplus(places: F64, may_go: np.ndarray, policy: KeepPolicy) -> I64:
     """Indices of those that have enough others around; those that stay anyway count first, then the oldest."""
     kept: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
     found, reach = list[int](), policy.spacing_m**2
+    around = [step for step in _AROUND if places[:, 2].any() or not step[2]]
     for n in np.argsort(may_go, kind="stable").tolist():
         x, y, z = places[n].tolist()
         cell = int(x // policy.spacing_m), int(y // policy.spacing_m), int(z // policy.spacing_m)
         if may_go[n]:
-            around = (kept.get((cell[0] + a, cell[1] + b, cell[2] + c), ()) for a, b, c in _AROUND)
-            near = sum((p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2 < reach for some in around for p, q, r in some)
+            close = [kept[at_it] for a, b, c in around if (at_it := (cell[0] + a, cell[1] + b, cell[2] + c)) in kept]
+            near = sum((p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2 < reach for some in close for p, q, r in some)
             if near >= policy.poses:
                 found.append(n)
                 continue
