@@ -8,8 +8,9 @@ import numpy as np
 from factorbus.journal import chain
 from factorbus.journal.records import JournalRecord, Last
 from factorbus.proto import codec
-from factorbus.proto.closures import CLOSURE_STATES, JUDGE, Suspects, decode_suspects
+from factorbus.proto.closures import CLOSURE_STATES, Suspects, decode_suspects
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
+from factorbus.proto.own_clients import JUDGE
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Arrived, Outcome, Refuse, Stepped, Verdict
 from factorbus.service.journal.library import make_map_solver

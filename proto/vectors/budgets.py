@@ -1,8 +1,10 @@
-"""Golden messages of a map whose steps have a budget, §21: how it is made, what a delta says, and its records."""
+"""Golden messages of a map whose steps have a budget, §21: how it is made, what a delta says, and its records;
+and how one is made that keeps some poses, §22."""
 
 import numpy as np
 
 from factorbus.proto import codec
+from factorbus.proto.keep import keep_text
 from factorbus.proto.messages import Delta, Variables
 from factorbus.proto.records import JournalPlace, RecordsPush, SentRecord, encode_records_push
 from factorbus.proto.symbols import symbol
@@ -22,6 +24,7 @@ def messages() -> dict[str, bytes]:
     records = (SentRecord(5, (), further=True, budget=_UNITS), SentRecord(6, (), further=True))
     return {
         "admin_create_budget": codec.encode_map({"map": "kitchen", "mode": "auto", "budget_ms": 10.0}),
+        "admin_create_keep": codec.encode_map({"map": "town", "mode": "auto", "keep": keep_text("per_area=2")}),
         "delta_budget": codec.encode_delta(Delta(_EPOCH, 41, 40, (moved,), report)),
         "records_push_budget": encode_records_push(RecordsPush(place, records)),
     }

@@ -13,8 +13,8 @@ from factorbus.client import Draft
 from factorbus.journal.problems import JournalFailed
 from factorbus.journal.records import ACCEPTED
 from factorbus.journal.store import open_store
-from factorbus.proto.closures import JUDGE
 from factorbus.proto.messages import Accepted, Batch, Change
+from factorbus.proto.own_clients import JUDGE
 from factorbus.proto.problems import Problem
 from factorbus.proto.records import JournalPlace
 

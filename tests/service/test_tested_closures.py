@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from tested_maps import TestedMap, between, corridor, right
 
 from factorbus.journal.records import ACCEPTED, REFUSED
-from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, JUDGE, ClosureEntry, decode_closure_entry
+from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, ClosureEntry, decode_closure_entry
 from factorbus.proto.messages import Batch, Change, Factors, Variables
+from factorbus.proto.own_clients import JUDGE
 from factorbus.solver import Solver
 from factorbus.solver.closures import ahead, ledger
 from factorbus.solver.closures.judging import ClosureJudge, residuals_weighed

@@ -21,7 +21,7 @@ from replicas import Link, replica_settings, upstream_row, wait_until_level
 from factorbus.client import Changes, Draft, Map, Refused, connect
 from factorbus.journal.store import open_store
 from factorbus.proto import keys
-from factorbus.proto.closures import JUDGE
+from factorbus.proto.own_clients import JUDGE
 
 POSES = 260
 

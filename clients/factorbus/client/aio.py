@@ -108,10 +108,16 @@ class Bus:
         return await asyncio.to_thread(self._bus.stats)
 
     async def create(
-        self, name: str, mode: str = "auto", *, closures: str | None = None, budget_ms: float | None = None
+        self,
+        name: str,
+        mode: str = "auto",
+        *,
+        closures: str | None = None,
+        budget_ms: float | None = None,
+        keep: str | Mapping[str, Any] | None = None,
     ) -> MapRow:
-        """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName, NotSupported."""
-        return await asyncio.to_thread(self._bus.create, name, mode, closures=closures, budget_ms=budget_ms)
+        """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName, BadOption, NotSupported."""
+        return await asyncio.to_thread(self._bus.create, name, mode, closures=closures, budget_ms=budget_ms, keep=keep)
 
     async def fork(self, name: str, target: str) -> MapRow:
         """A new map that begins as `name` is now.  Raises as `factorbus.client.Bus.fork`."""

@@ -18,6 +18,7 @@ from factorbus.proto import codec, fields, keys
 from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
 from factorbus.proto.interest import Interest, checked_interest
+from factorbus.proto.keep import KEEP_ALL, keep_text
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadOption, NotSupported, Problem, Refused, UnknownMap
 
@@ -165,19 +166,24 @@ class Bus:
         *,
         closures: str | None = None,
         budget_ms: float | None = None,
+        keep: str | Mapping[str, Any] | None = None,
     ) -> MapRow:
         """Create map `name`, or find it as it is if its mode is the same, and so are the others where they are given.
 
         closures: "trust" or "test", what becomes of its loop closures.  budget_ms: what a step of it may take, in
-        milliseconds; what does not fit follows in later steps; 0: there is no bound.  None of either: that of a map
-        which is there, or what the service has for new ones.
-        Raises Refused, Unavailable, BadName, NotSupported.
+        milliseconds; what does not fit follows in later steps; 0: there is no bound.  keep: which poses stay of places
+        that are driven through again and again, "all" or such as {"per_area": 2.0, "window": 50}.  None of any: that
+        of a map which is there, or what the service has for new ones.
+        Raises Refused, Unavailable, BadName, BadOption, NotSupported.
         """
         asked = {"map": keys.checked_name("map", name), "mode": mode, "closures": closures, "budget_ms": budget_ms}
+        asked["keep"] = None if keep is None else keep_text(keep)
         given = {field: value for field, value in asked.items() if value is not None}
         row = self._admin("create", given, _row, timeout_s)
         if budget_ms and row.budget_ms != budget_ms:  # who knows of none skips the field
             raise NotSupported("a map whose steps have a budget", str(row.protocol.get("product", "")))
+        if asked["keep"] not in (None, row.keep):
+            raise NotSupported("a map that keeps some poses alone", str(row.protocol.get("product", "")))
         return row
 
     def fork(self, name: str, target: str, timeout_s: float | None = None) -> MapRow:
@@ -287,4 +293,5 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         closures=fields.text(where, content, "closures", default="trust"),
         budget_ms=fields.number(where, content, "budget_ms") if "budget_ms" in content else 0.0,
         complete=fields.flag(where, content, "complete", True),
+        keep=fields.text(where, content, "keep", default=KEEP_ALL),
     )

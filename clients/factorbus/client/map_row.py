@@ -16,7 +16,8 @@ class MapRow:
     itself, unless an insert comes.  reproducible: as far as is known, its journal gives the same estimate again to the
     bit; if not, `reason` says why; None: it has no journal, or the service does not say.  closures: "test" where loop
     closures are tested when they come.  budget_ms: what a step of it may take; 0: there is no bound.  complete: the
-    last step left nothing for later ones.
+    last step left nothing for later ones.  keep: which poses stay of places that are driven through again and again, as
+    `create` has it, with every number; "all": each.
     """
 
     name: str
@@ -35,3 +36,4 @@ class MapRow:
     closures: str = "trust"
     budget_ms: float = 0.0
     complete: bool = True
+    keep: str = "all"

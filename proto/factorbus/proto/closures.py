@@ -1,10 +1,9 @@
 """Loop closures that a map tests: what it says of them, and how its verdicts are written down.  Both ways, as bytes.
 
 A map with the policy `test` has a state for each closure.  Its verdicts are entries of its journal, those of the client
-`JUDGE`: a name that no client on the bus can have.  Readers raise BadMessage, TooLarge.
+`own_clients.JUDGE`: a name that no client on the bus can have.  Readers raise BadMessage, TooLarge.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,7 +17,6 @@ from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, MessageLimits
 from factorbus.proto.problems import BadMessage
 from factorbus.wording import counted
 
-JUDGE = "closures.judge"
 CLOSURE_POLICIES = ("trust", "test")
 CLOSURE_STATES = ("accepted", "suspect", "rejected", "restored")
 # Why a state is what it is.
@@ -73,11 +71,6 @@ class Suspects:
     chance: F64 = field(default_factory=lambda: np.empty(0))
     came: I64 = field(default_factory=lambda: np.empty(0, np.int64))
     changed: I64 = field(default_factory=lambda: np.empty(0, np.int64))
-
-
-def count_inserts(entries: Iterable[Any]) -> int:
-    """How many of the entries of a record are inserts of clients; the others are verdicts."""
-    return sum(entry.client != JUDGE for entry in entries)
 
 
 def encode_closure_entry(message: ClosureEntry) -> bytes:

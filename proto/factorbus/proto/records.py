@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from factorbus.proto import fields
-from factorbus.proto.closures import JUDGE
 from factorbus.proto.codec import decode_map, encode_map
 from factorbus.proto.keys import is_name
 from factorbus.proto.limits import ANSWER_LIMITS, MessageLimits
+from factorbus.proto.own_clients import OWN_CLIENTS
 from factorbus.proto.problems import BadMessage, TooLarge
 from factorbus.wording import counted
 
@@ -236,7 +236,7 @@ def _insert(where: str, row: Any, digest_of: Callable[[bytes], int]) -> SentInse
         raise BadMessage(where, "is something else", "[client, sequence, message], and where refused outcome, problem")
     client, sequence, message = row[:3]
     outcome, problem = row[3:] or (0, b"")
-    if not (is_name(client) or client == JUDGE) or not _is_whole(sequence) or sequence < 1:
+    if not (is_name(client) or client in OWN_CLIENTS) or not _is_whole(sequence) or sequence < 1:
         raise BadMessage(where, "has no client or number", "a client's name and a number from 1")
     if outcome not in _OUTCOMES or not isinstance(problem, bytes) or bool(problem) != bool(outcome):
         raise BadMessage(where, f"has the outcome {outcome!r}", "1 or 2, and the problem that it was answered")

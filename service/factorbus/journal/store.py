@@ -22,7 +22,7 @@ from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_f
 from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal, NotWritten
 from factorbus.journal.records import Checkpoint, Entry, Epoch, Header, JournalRecord, Last, Maker, Sender
 from factorbus.ownership import private_file
-from factorbus.proto.closures import JUDGE
+from factorbus.proto.own_clients import JUDGE, KEEPER
 
 NAME = "journal.db"
 _SCHEMA = """
@@ -126,8 +126,9 @@ class Store:
         with self._reading():
             (records,) = self._db.execute("SELECT COUNT(*) FROM record").fetchone()
             row = self._db.execute(
-                "SELECT SUM(client != :judge), COUNT(DISTINCT NULLIF(client, :judge)), SUM(LENGTH(message)) FROM entry",
-                {"judge": JUDGE},
+                "SELECT SUM(client NOT IN (:judge, :keeper)), "
+                "COUNT(DISTINCT NULLIF(NULLIF(client, :judge), :keeper)), SUM(LENGTH(message)) FROM entry",
+                {"judge": JUDGE, "keeper": KEEPER},
             ).fetchone()
         return {"records": records, "inserts": row[0] or 0, "clients": row[1], "message_bytes": row[2] or 0}
 

@@ -44,6 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--durability", choices=DURABILITIES, help="what an answer promises: see service/README.md")
     parser.add_argument("--closures", choices=CLOSURE_POLICIES, help="of new maps: believe loop closures, or test them")
     parser.add_argument("--budget-ms", type=float, metavar="MS", help="of new maps: what a step may take; 0: no bound")
+    parser.add_argument("--keep", metavar="POLICY", help="of new maps: poses to keep, such as per_area=2,window=50")
     parser.add_argument("--standby", action="store_true", help="wait until the journal's owner is gone, and take over")
     parser.add_argument("--upstream", metavar="ENDPOINT", help="be a replica of the service there")
     parser.add_argument("--upstream-zenoh", metavar="FILE", help="Zenoh configuration of the session with it")
@@ -66,6 +67,7 @@ def _config(options: argparse.Namespace) -> Config:
             "durability",
             "closures",
             "budget_ms",
+            "keep",
             "upstream",
             "upstream_zenoh",
         )

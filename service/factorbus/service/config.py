@@ -11,6 +11,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from factorbus.proto.budget import BUDGET_SPAN_MS, BUDGET_WANTED
 from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.endpoints import checked_endpoint
+from factorbus.proto.keep import KEEP_ALL, keep_text
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import MessageLimits
 from factorbus.proto.problems import Problem
@@ -87,6 +88,7 @@ class Config:
         "trust"  # of maps that are new here, unless the client that creates one says otherwise: trust or test
     )
     budget_ms: float = 0.0  # likewise: what a step of such a map may take; 0: it has no bound
+    keep: str = KEEP_ALL  # likewise: which poses of places that are driven through again and again
     zenoh: str = ""
     insecure: bool = False
     warm: bool = True  # compile every kernel before taking the first insert
@@ -147,6 +149,10 @@ def checked_config(config: Config) -> Config:
         raise BadConfig(f"closures is {config.closures!r}; wanted {' or '.join(CLOSURE_POLICIES)}")
     if not BUDGET_SPAN_MS[0] <= config.budget_ms <= BUDGET_SPAN_MS[1]:
         raise BadConfig(f"budget_ms is {config.budget_ms:g}; wanted {BUDGET_WANTED}")
+    try:
+        keep_text(config.keep)
+    except Problem as bad:
+        raise BadConfig(bad.message) from None
     if config.durability not in DURABILITIES:
         raise BadConfig(f"durability is {config.durability!r}; wanted {', '.join(DURABILITIES)}")
     if config.standby and not config.journal:

@@ -24,6 +24,7 @@ ASKED = (
     "inertial",
     "own",
     "ranges",
+    "sessions",
     "sizing",
 )  # a minute or two; on request
 
@@ -73,6 +74,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
                every step over its batch optimum, and GTSAM's optimum; --only, --every, --steps
     own        a kind of factor written as a formula beside the built-in one, and a Python factor in GTSAM: time of a
                step; --only, --poses
+    sessions   a town driven through day after day, in a map that keeps some poses beside one that keeps all: size,
+               error of the trajectory, CPU time of a step; --drives, --poses, --seeds, --keep
     sizing     what simulated worlds need: memory of a pose, CPU time of an insert, bytes for a viewer; --worlds,
                --poses, --window
     all        cholesky, bus, idp, ros2 and journal: some minutes

@@ -54,6 +54,12 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
     metavar="MS",
     help="Of new maps: what a step may take; the rest follows in later steps.  [default: 0, no bound]",
 )
+@click.option(
+    "--keep",
+    metavar="POLICY",
+    help="Of new maps: which poses stay of places that are driven through again and again, such as "
+    "per_area=2,window=50 (see below).  [default: all]",
+)
 @click.option("--standby", is_flag=True, default=None, help="Wait until the journal's owner is gone, and take over.")
 @click.option("--name", metavar="NAME", help="Of this service, as the bus sees it.  [default: made up]")
 @click.option("--warm/--no-warm", default=None, help="Compile every kernel before the first insert.  [default: warm]")
@@ -87,6 +93,14 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
       commit   the disk has it: it survives a power cut, as far as the disk keeps its word
       group    it is written within 50 ms; a crash may cost what was answered in that time, and begins a new epoch
       none     it is written now and then, with no promise but for an orderly stop
+
+    \b
+    With --keep the size of a map follows the area, not the time. When it is idle, poses go that it has enough of, and
+    what they say of others stays. per_area=2:3,window=50,landmarks=2,loss=1 means:
+      per_area   of the poses within 2 m of each other 3 stay (1, where it says 2 alone)
+      window     the newest 50 of each letter stay
+      landmarks  a pose stays that sees a landmark which 2 poses or fewer see
+      loss       the most nats that may be lost for each pose that goes
 
     \b
     A configuration file has the names of these options and more, for example:

@@ -98,6 +98,7 @@ def _map(row: Mapping[str, Any]) -> str:
         f"{counted(row['clients'], 'client')}",
         *([budget_line(row["budget"])] if "budget" in row else []),
         *([_closures(row["closure_states"])] if "closure_states" in row else []),
+        *([_kept(row)] if "kept" in row else []),
         *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
         *(f"journal {name}: {value}" for name, value in shown_fields(row.get("journal", {}))),
     ]
@@ -108,6 +109,15 @@ def _closures(states: Mapping[str, int]) -> str:
     """How many loop closures are in each state."""
     told = ", ".join(f"{count} {state}" for state, count in states.items())
     return f"loop closures are tested: {told}"
+
+
+def _kept(row: Mapping[str, Any]) -> str:
+    """What the map keeps, and what became of the rest since the service has it open."""
+    kept = row["kept"]
+    lost = f"which lost {kept['loss']:.3g} nats, {kept['largest_loss']:.3g} of one at most" if kept["loss"] else ""
+    left = f"{kept['left']} more cannot go" if kept["left"] else ""
+    gone = ", ".join(filter(None, (f"{counted(kept['removed_poses'], 'pose')} taken out", lost, left)))
+    return f"keeps {row['keep']}: {gone}" + ("; the last try failed, see the service's log" if kept["failed"] else "")
 
 
 def budget_line(row: Mapping[str, Any]) -> str:

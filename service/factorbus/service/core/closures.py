@@ -4,13 +4,13 @@ client's inserts."""
 from collections.abc import Sequence
 
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE
+from factorbus.proto.own_clients import OWN_CLIENTS
 from factorbus.service.core.events import Effect, MovedClosure, Outcome, Publish, Verdict
 
 
 def asked_outcomes(verdict: Verdict) -> list[Outcome]:
     """Those of inserts that clients sent."""
-    return [outcome for outcome in verdict.outcomes if outcome.insert.client != JUDGE]
+    return [outcome for outcome in verdict.outcomes if outcome.insert.client not in OWN_CLIENTS]
 
 
 def closures_moved(moved: Sequence[MovedClosure], epoch: int, revision: int) -> list[Effect]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Any
 
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE
+from factorbus.proto.own_clients import OWN_CLIENTS
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core.admission import Admission
@@ -45,6 +45,7 @@ from factorbus.service.core.events import (
     reproducible_fields,
 )  # fmt: skip
 from factorbus.service.core.pending_questions import Reads, is_graft
+from factorbus.service.core.removals import IdleRemovals
 from factorbus.service.core.short_batches import ShortBatches
 from factorbus.service.core.statistics import InsertDone, MapStatistics
 from factorbus.service.questions.admin import MovedOn
@@ -58,10 +59,10 @@ class MapCore:
 
     def __init__(
         self, name: str, mode: str, epoch: int, limits: Limits, now: float, closures: str = "trust",
-        budget: StepBudget | None = None,
+        budget: StepBudget | None = None, removals: IdleRemovals | None = None,
     ) -> None:  # fmt: skip
         self.name, self.mode, self.epoch, self.closures = name, mode, epoch, closures
-        self._budget = budget or StepBudget()
+        self._budget, self.removals = budget or StepBudget(), removals or IdleRemovals()
         self.revision = self.variables = self.factors = 0
         self.differs: str | None = None  # as `Restored` has it
         self._limits, self._created = limits, now
@@ -70,10 +71,9 @@ class MapCore:
         self._reads = Reads()
         self._running: InsertBatch | None = None
         self._unanswered = self._unanswered_bytes = 0  # given to the solver, and not answered
-        self._must_reload = False
+        self._must_reload = self._drained = False
         self._started, self._short = 0.0, ShortBatches()
         self._closing: Problem | None = None
-        self._drained = False
         self._since_snapshot = [0, 0]  # steps, bytes of deltas
         self._solver_cpu_s = 0.0
         self._statistics = MapStatistics()
@@ -93,7 +93,7 @@ class MapCore:
             "state": "blocked" if self._admission.blocked else "open",
             "converged": self._converging.converged,
             "converging": self._converging.converging,
-            **self._budget.row(),
+            **self._budget.row() | self.removals.row(),
             **reproducible_fields(self.differs),
         }
 
@@ -147,6 +147,7 @@ class MapCore:
         """The solver's word on some of what it has."""
         effects, asked = closures_moved(verdict.closures, self.epoch, verdict.revision), asked_outcomes(verdict)
         self._unanswered -= len(asked)
+        effects += self.removals.told(verdict, self.epoch)
         for outcome in asked:
             self._unanswered_bytes -= outcome.insert.size
             effects += self._admission.answer(outcome.insert, outcome.answer)
@@ -192,6 +193,7 @@ class MapCore:
         effects = self._count_refused(self._admission.take_back(problem, given=True))
         self._unanswered = self._unanswered_bytes = 0
         self._converging.undone()
+        self.removals.undone()
         self._must_reload = True
         return self._go_on([*effects, self._event("blocked")], now)
 
@@ -204,7 +206,7 @@ class MapCore:
         self, senders: Iterable[tuple[str, int, Iterable[tuple[int, int, object]]]], restored: Restored
     ) -> None:
         """The map was here before: what its clients have sent, and how it is."""
-        for name, following, answered in ((*sender,) for sender in senders if sender[0] != JUDGE):
+        for name, following, answered in ((*sender,) for sender in senders if sender[0] not in OWN_CLIENTS):
             self._admission.restore(name, following, answered, self._created)
         self.revision, self.variables, self.factors, self._statistics.chi2 = restored[:4]
         use = BudgetUse(unsolved=math.inf, complete=restored.complete)
@@ -231,9 +233,10 @@ class MapCore:
         closures: Sequence[MovedClosure], now: float,
     ) -> list[Effect]:  # fmt: skip
         """Records of another journal were applied: (client, number, digest, answer) of each insert; what came of it."""
-        effects = [effect for i in inserts if i[0] != JUDGE for effect in self._admission.note(*i, now)]
+        effects = [effect for i in inserts if i[0] not in OWN_CLIENTS for effect in self._admission.note(*i, now)]
         effects += [effect for stepped in steps for effect in self.stepped(stepped)]
         self._converging.hold(now)  # who sent them takes further steps, too, and sends those
+        self.removals.ended(1, now)
         return [*effects, *closures_moved(closures, self.epoch, self.revision)]
 
     def _moved_on(self, revision: int, delta_bytes: int) -> None:
@@ -257,6 +260,7 @@ class MapCore:
 
     def _free(self, applied: Applied, taken: int) -> None:
         self._running = None
+        self.removals.ended(taken, applied.now)
         self._statistics.closures = applied.closures
         self._converging.ended(applied.solver_cpu_s - self._solver_cpu_s, applied.now)
         seconds = applied.now - self._started
@@ -315,7 +319,7 @@ class MapCore:
             "further_steps": self._converging.steps,
             "gave_up": self._converging.gave_up,
             "solver_cpu_s": self._solver_cpu_s,
-            **self._budget.stats(),
+            **self._budget.stats() | self.removals.stats(),
             **self._statistics.stats(),
         }
 
@@ -334,17 +338,18 @@ class MapCore:
         """Give the solver what waits, if it is free."""
         if self._running is not None:
             return effects
-        limits = self._limits
         room = self._has_room()
-        further = self._may_go_on(now)
-        if self._reads or self._must_reload or (self._admission.ready and room) or further:
+        further = (idle := self._is_idle()) and self._converging.is_due(now)
+        keep = idle and not further and self.removals.is_due(now)
+        if self._reads or self._must_reload or (self._admission.ready and room) or further or keep:
             reads = self._reads.take()
             if is_graft(reads):  # nothing goes with it
-                room = further = False
-            inserts = self._admission.take(limits.step_inserts) if room else ()
-            short = self._short.is_short(reads, inserts, now)
+                room = further = keep = False
+            inserts = self._admission.take(self._limits.step_inserts) if room else ()
+            short = not keep and self._short.is_short(reads, inserts, now)
             units = self._budget.units(self._converging.in_vain if further else 0)
-            self._running = InsertBatch(reads, inserts, short, self._must_reload, further, units)
+            self._running = InsertBatch(reads, inserts, short, self._must_reload, further, units, keep)
+            self.removals.began(keep)
             if inserts or further:
                 self._converging.began(further)
             self._must_reload = False
@@ -357,11 +362,10 @@ class MapCore:
             effects.append(Drained())
         return effects
 
-    def _may_go_on(self, now: float) -> bool:
-        """May the solver take a further step?  Inserts come first, and nothing is left to be told or written."""
+    def _is_idle(self) -> bool:
+        """May the solver do what nobody asked for?  Inserts come first, and nothing is left to be told or written."""
         waits = self._admission.ready or self._unanswered or self._must_reload
-        stopped = self._admission.blocked or self._closing is not None
-        return not waits and not stopped and self._converging.is_due(now)
+        return not (waits or self._admission.blocked or self._closing is not None)
 
     def _has_room(self) -> bool:
         """May the solver have more, or has the journal to write first?"""
@@ -374,12 +378,11 @@ class MapCore:
             or content.convert_below
             or self._running is not None
             or self._reads
+            or self._must_reload
             or not self._short.is_quick(arrived.size, arrived.now)
+            or not self._has_room()
+            or not self._admission.take_alone(arrived)
         ):
-            return None
-        if self._must_reload or not self._has_room():
-            return None
-        if not self._admission.take_alone(arrived):
             return None
         self._started = arrived.now
         self._converging.began(False)
@@ -389,9 +392,8 @@ class MapCore:
         return run
 
     def _count_refused(self, effects: list[Effect]) -> list[Effect]:
-        for effect in effects:
-            if isinstance(effect, Refuse):
-                self._statistics.refused(effect.problem)
+        for refused in (effect for effect in effects if isinstance(effect, Refuse)):
+            self._statistics.refused(refused.problem)
         return effects
 
     def _event(self, what: str) -> Publish:

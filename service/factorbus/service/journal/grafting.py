@@ -19,8 +19,8 @@ from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Journal
 from factorbus.journal.rewriting import UpstreamPlace
 from factorbus.journal.store import open_store
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE, count_inserts
 from factorbus.proto.messages import Insert
+from factorbus.proto.own_clients import OWN_CLIENTS, count_inserts
 from factorbus.proto.records import JournalPlace, SentInsert, SentRecord
 from factorbus.service.core.events import MovedClosure, Stepped, Verdict
 from factorbus.service.journal.keeping import Keeper
@@ -187,8 +187,9 @@ class _Grafting:
         ids = [entry.first_factor for record in own for entry in record.entries if entry.first_factor >= 0]
         first, moved = min(ids, default=0), False
         for record in own:
-            # Verdicts on closures are of the map as it was: what is new here is judged with the next insert.
-            own_inserts = [entry for entry in record.entries if entry.client != JUDGE]
+            # Verdicts on closures, and which poses are redundant, are of the map as it was: closures are judged with the
+            # next insert, poses looked at when the map is idle.
+            own_inserts = [entry for entry in record.entries if entry.client not in OWN_CLIENTS]
             entries = [entry for entry in own_inserts if not self._is_there(entry, there)]
             if not entries and not record.further:
                 continue

@@ -23,7 +23,7 @@ from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnr
 from factorbus.journal.records import Checkpoint, JournalRecord, Last
 from factorbus.journal.rewriting import UpstreamPlace, note_upstream, rewrite
 from factorbus.journal.store import Store, open_store
-from factorbus.proto.closures import count_inserts
+from factorbus.proto.own_clients import count_inserts
 from factorbus.service.core.events import Arrived, Stepped
 from factorbus.service.journal.checkpoint_plan import CheckpointPlan
 from factorbus.service.journal.items import AfterWriting, HandedBatch, NotedCheckpoint, SolverReloaded

@@ -20,6 +20,7 @@ from factorbus.journal.records import Epoch, Header, Maker
 from factorbus.journal.store import NAME, Checkpoint, Last, Store, create, open_store
 from factorbus.proto.budget import BUDGET_OPTION, BUDGET_SPAN_MS, BUDGET_WANTED
 from factorbus.proto.closures import CLOSURE_POLICIES
+from factorbus.proto.keep import KEEP_ALL, KEEP_OPTION, keep_text
 from factorbus.proto.nearest import nearest
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Config, Limits
@@ -42,7 +43,8 @@ def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: L
     """A map solver with a new solver in `mode`, and the other settings as `options` has them.  Raises JournalOption.
 
     closures: what becomes of loop closures, one of CLOSURE_POLICIES, is the map solver's own; by default they are
-    trusted.  budget_ms: what its steps may take; by default they have no bound.
+    trusted.  budget_ms: what its steps may take; by default they have no bound.  keep: which poses the map keeps; by
+    default all.
     """
     from factorbus.solver import Options, Solver
     from factorbus.solver.errors import BadOption
@@ -53,6 +55,8 @@ def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: L
     own = {}
     if (budget_ms := options.pop(BUDGET_OPTION, 0.0)) != 0.0:
         own[BUDGET_OPTION] = _checked_budget(budget_ms)
+    if (keep := _checked_keep(options.pop(KEEP_OPTION, KEEP_ALL))) != KEEP_ALL:
+        own[KEEP_OPTION] = keep
     for name in options:
         if name not in known:
             raise JournalOption(name, "there is no such option here" + nearest(name, known))
@@ -68,12 +72,22 @@ def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: L
 
 def own_options(made_as: MadeAs) -> dict[str, Any]:
     """The settings of a map that are not its solver's."""
-    return {"closures": made_as.closures or "trust", BUDGET_OPTION: made_as.budget_ms or 0.0}
+    own = {"closures": made_as.closures or "trust", BUDGET_OPTION: made_as.budget_ms or 0.0}
+    return own | {KEEP_OPTION: made_as.keep or KEEP_ALL}
 
 
 def made_as_of(mode: str, options: Mapping[str, Any]) -> MadeAs:
     """How a map with these settings was made."""
-    return MadeAs(mode, str(options.get("closures", "trust")), float(options.get(BUDGET_OPTION, 0.0)))
+    budget_ms, keep = float(options.get(BUDGET_OPTION, 0.0)), str(options.get(KEEP_OPTION, KEEP_ALL))
+    return MadeAs(mode, str(options.get("closures", "trust")), budget_ms, keep)
+
+
+def _checked_keep(keep: Any) -> str:
+    """A journal's, in its one form.  Raises JournalOption."""
+    try:
+        return keep_text(str(keep))
+    except Problem as bad:
+        raise JournalOption(KEEP_OPTION, bad.message) from None
 
 
 def _checked_budget(budget_ms: Any) -> float:

@@ -20,7 +20,8 @@ from factorbus.journal.problems import JournalDiffers
 from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, JournalRecord, Sender
 from factorbus.journal.store import Checkpoint, Last, Store
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE, decode_closure_entry
+from factorbus.proto.closures import decode_closure_entry
+from factorbus.proto.own_clients import JUDGE
 from factorbus.service.core.events import Arrived, Verdict
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import message_digest, read_again

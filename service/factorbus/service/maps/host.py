@@ -244,6 +244,8 @@ class Host:
 
     def _solve(self, run: InsertBatch, tell: Perform) -> None:
         try:
+            if run.keep:
+                run = self._with_removals(run)
             if self._keeper is not None:
                 self._run_kept(run, self._keeper, tell)
                 return
@@ -270,6 +272,13 @@ class Host:
             with self._lock:
                 effects = self.core.failed(Internal(reference), time.monotonic())
             self._perform(effects)
+
+    def _with_removals(self, run: InsertBatch) -> InsertBatch:
+        """With the map's own insert, which takes out poses that it has enough of, if there are any."""
+        planned, inserts = self._map_solver.plan_removals()
+        with self._lock:
+            self.core.removals.planned(planned)
+        return run._replace(inserts=inserts)
 
     def _tell(self, events: Iterable[Verdict | Stepped | Applied], tell: Perform) -> None:
         """What comes of an InsertBatch, step by step."""

@@ -5,9 +5,11 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from factorbus.proto.keep import keep_text
 from factorbus.service.config import Config
 from factorbus.service.core.budget import StepBudget
 from factorbus.service.core.map_state import MapCore
+from factorbus.service.core.removals import IdleRemovals
 from factorbus.service.journal.library import (
     CopiedAt,
     Kept,
@@ -36,7 +38,7 @@ class MapMaker:
         if library is not None and library.has(name):
             kept = library.open(name, limits, asked)
         else:
-            made_as = settled(asked, self._config.closures, self._config.budget_ms)
+            made_as = settled(asked, self._config.closures, self._config.budget_ms, keep_text(self._config.keep))
             if library is None:
                 epoch, mode = secrets.randbits(62) | 1, made_as.mode or "auto"
                 made = make_map_solver(mode, own_options(made_as), epoch, limits)
@@ -66,4 +68,5 @@ class MapMaker:
         """Of a map with this solver."""
         made_as = made_as_of(mode, map_solver.options())
         budget = StepBudget(made_as.budget_ms, self._rate.units_per_ms()) if made_as.budget_ms else None
-        return MapCore(name, mode, epoch, self._config.limits, time.monotonic(), made_as.closures, budget)
+        removals = IdleRemovals(made_as.keep, here=not self._config.upstream)
+        return MapCore(name, mode, epoch, self._config.limits, time.monotonic(), made_as.closures, budget, removals)

@@ -165,6 +165,8 @@ def _of_maps(maps: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
         yield Family(name, "histogram", what, ("map",), [((m,), row[key]) for m, row in rows.items()])
     states = [((m, s), n) for m, row in rows.items() for s, n in row.get("closure_states", {}).items()]
     yield Family("map_closures", "gauge", "Loop closures of maps that test theirs", ("map", "state"), states)
+    kept = {m: row["kept"] for m, row in rows.items() if "kept" in row}
+    yield from _extra("kept", "map", kept)
     yield from _extra("journal", "map", {m: row.get("journal", {}) for m, row in rows.items()})
     yield from _of_budgets({m: row["budget"] for m, row in rows.items() if "budget" in row})
 

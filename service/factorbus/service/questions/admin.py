@@ -5,6 +5,7 @@ from typing import NamedTuple
 from factorbus.proto import codec, fields
 from factorbus.proto.budget import BUDGET_SPAN_MS, BUDGET_WANTED
 from factorbus.proto.closures import CLOSURE_POLICIES
+from factorbus.proto.keep import KEEP_ALL, keep_text
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.problems import BadMessage, Problem
@@ -44,6 +45,17 @@ class OtherBudget(Problem):
         super().__init__(
             f"the steps of map {name!r} have {has}, not {wanted:g} ms, and keep it; join it with that, or drop it",
             budget_ms=budget_ms,
+        )
+
+
+class OtherKeep(Problem):
+    """The map is there, and keeps other poses than asked for."""
+
+    code = "other_keep"
+
+    def __init__(self, name: str, keep: str, wanted: str) -> None:
+        super().__init__(
+            f"map {name!r} keeps {keep!r}, not {wanted!r}, and stays so; join it with that, or drop it", keep=keep
         )
 
 
@@ -131,14 +143,17 @@ class Fork(NamedTuple):
 
 
 class MadeAs(NamedTuple):
-    """How a map is made, or asked for.  mode None, closures "", budget_ms None: whichever, of a new one the service's.
+    """How a map is made, or asked for.  mode None, closures "", budget_ms None, keep "": whichever, of a new one the
+    service's.
 
-    closures: its policy for loop closures.  budget_ms: of its steps; 0: they have no bound.
+    closures: its policy for loop closures.  budget_ms: of its steps; 0: they have no bound.  keep: which poses it
+    keeps, as `keep_text` has it.
     """
 
     mode: str | None = None
     closures: str = ""
     budget_ms: float | None = None
+    keep: str = ""
 
 
 def read_create(payload: bytes) -> tuple[str, MadeAs]:
@@ -153,7 +168,8 @@ def read_create(payload: bytes) -> tuple[str, MadeAs]:
     budget_ms = None
     if content.get("budget_ms") is not None:
         budget_ms = fields.parameter("create", content, "budget_ms", BUDGET_SPAN_MS, BUDGET_WANTED, 0.0)
-    return _map_name(content, "create"), MadeAs(mode, closures, budget_ms)
+    keep = fields.text("create", content, "keep", "") if content.get("keep") is not None else ""
+    return _map_name(content, "create"), MadeAs(mode, closures, budget_ms, keep and keep_text(keep, "create.keep"))
 
 
 class Drop(NamedTuple):
@@ -182,22 +198,26 @@ def read_fork(payload: bytes) -> Fork:
 
 
 def check_made_as(name: str, made_as: MadeAs, asked: MadeAs) -> None:
-    """Is map `name`, made so, as it is asked for?  Raises OtherMode, OtherClosures, OtherBudget."""
+    """Is map `name`, made so, as it is asked for?  Raises OtherMode, OtherClosures, OtherBudget, OtherKeep."""
     if asked.mode not in (None, made_as.mode):
         raise OtherMode(name, str(made_as.mode), asked.mode)
     if asked.closures not in ("", made_as.closures):
         raise OtherClosures(name, made_as.closures, asked.closures)
     if asked.budget_ms not in (None, made_as.budget_ms):
         raise OtherBudget(name, made_as.budget_ms or 0.0, asked.budget_ms)
+    if asked.keep not in ("", made_as.keep):
+        raise OtherKeep(name, made_as.keep, asked.keep)
 
 
-def settled(asked: MadeAs, closures: str, budget_ms: float) -> MadeAs:
+def settled(asked: MadeAs, closures: str, budget_ms: float, keep: str = KEEP_ALL) -> MadeAs:
     """How a new map is made that is asked for so, by a service with these for new maps.  Raises NoBudget."""
     mode = settled_mode(asked.mode or "auto")
     if asked.budget_ms and not mode_named(mode).tree:
         raise NoBudget(mode)
     own = budget_ms if mode_named(mode).tree else 0.0
-    return MadeAs(mode, asked.closures or closures, own if asked.budget_ms is None else asked.budget_ms)
+    return MadeAs(
+        mode, asked.closures or closures, own if asked.budget_ms is None else asked.budget_ms, asked.keep or keep
+    )
 
 
 def settled_mode(mode: str) -> str:

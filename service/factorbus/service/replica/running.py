@@ -18,7 +18,7 @@ from factorbus.journal.records import JournalRecord
 from factorbus.journal.rewriting import UpstreamPlace, upstream_of
 from factorbus.journal.store import open_store
 from factorbus.proto import codec, keys
-from factorbus.proto.closures import count_inserts
+from factorbus.proto.own_clients import count_inserts
 from factorbus.proto.problems import Internal, Problem, Unavailable
 from factorbus.proto.records import (
     MOST_NAMED,

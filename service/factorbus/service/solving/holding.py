@@ -14,16 +14,20 @@ from typing import Any
 
 import numpy as np
 
+from factorbus.proto.arrays import I64
 from factorbus.proto.budget import BUDGET_OPTION
 from factorbus.proto.closures import Suspects, encode_suspects
+from factorbus.proto.keep import KEEP_ALL, KEEP_OPTION, try_keep
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Limits
 from factorbus.service.core.budget import use_of
-from factorbus.service.core.events import Stepped
+from factorbus.service.core.events import Arrived, Stepped
+from factorbus.service.core.removals import Planned
 from factorbus.service.questions.answers import Copied, Question, QuestionCopies, snapshot
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.service.solving.messages import StepMessages
+from factorbus.service.solving.planning import NOTHING_STAYS, plan_insert
 from factorbus.solver.divergence import check_step, is_usual, undone
 
 # Until a copy of a map is at work there are the state on its way, the same as bytes of a file, and the copy itself;
@@ -94,6 +98,17 @@ class Holding:
         """The answer to ask/suspects; `every`: of all closures.  Where they are not tested there are none."""
         del every
         return encode_suspects(Suspects(self._epoch, self._revision, "trust"))
+
+    def plan_removals(self) -> tuple[Planned, tuple[Arrived, ...]]:
+        """What goes next by the policy of the map, and the insert that does it; of a broken map, nothing."""
+        keep = try_keep(str(self._options.get(KEEP_OPTION, KEEP_ALL)))
+        if keep is None or self._broken:
+            return Planned(0), ()
+        return plan_insert(self._solver.factor_graph, keep, self._staying(), self._revision + 1)
+
+    def _staying(self) -> I64:
+        """Keys of poses that stay whatever the policy says."""
+        return NOTHING_STAYS
 
     def options(self) -> dict[str, Any]:
         """The settings of its solver."""

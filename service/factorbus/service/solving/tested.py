@@ -21,9 +21,11 @@ from typing import Any
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.closures import JUDGE, ClosureEntry, Suspects, encode_closure_entry, encode_suspects
+from factorbus.proto.arrays import I64
+from factorbus.proto.closures import ClosureEntry, Suspects, encode_closure_entry, encode_suspects
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Batch, Change, Insert
+from factorbus.proto.own_clients import JUDGE
 from factorbus.service.config import Limits
 from factorbus.service.core.events import (
     Applied,
@@ -150,6 +152,10 @@ class TestedMapSolver(MapSolver):
             self._forest.load(own["forest"])
             self._left_new = self._has_new()
         return same
+
+    def _staying(self) -> I64:
+        """A closure that is out may go in again: its poses stay."""
+        return np.array([key for c in self._ledger.closures if not c.is_in for key in c.keys], np.int64)
 
     def closure_counts(self) -> dict[str, int]:
         """How many are in each state."""

@@ -34,7 +34,7 @@ def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[Fac
         whole = quadratic(graph, rows, part)
         separator = whole.variables[len(part) :]
         if separator:
-            made += _as_factors(graph, separator, *_reduced(graph, whole, len(part)))
+            made += _as_factors(graph, separator, *reduced(graph, whole, len(part)))
     return made, used
 
 
@@ -77,7 +77,7 @@ def _check_separator(graph: FactorGraph, part: list[int], rows: list[int], gone:
         raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[separator].tolist(), MOST_JOINED)
 
 
-def _reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64]:
+def reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64]:
     """Λ and η of the separator once the first `count` variables have taken theirs.  (11.4)"""
     if not count:
         return whole.information, whole.eta
