@@ -34,6 +34,7 @@ from factorbus.proto.messages import (
 )
 from factorbus.proto.problems import BetterOptimum
 from factorbus.proto.stamps import LEAST_STAMP, NO_STAMP
+from factorbus.proto.step_history import StepHistory, encode_step_history
 from factorbus.proto.symbols import symbol
 from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver import Options, Solver
@@ -46,16 +47,17 @@ POSE, POINT = [100.0, 0, 0, 100, 0, 400], [64.0, 0.0, 64.0]
 FALSE = 3  # the id of the closure that is far off
 _DIGITS, _NOTHING, _MS, _SECONDS = 9, 1e-12, 1.5, 0.5
 # Fields of a bin that hold doubles which the solver has computed.
-_COMPUTED = ("values", "covariance", "distance", "threshold", "gain", "distances")
+_COMPUTED = ("chi2", "values", "covariance", "distance", "threshold", "gain", "distances")
 
 
 def messages() -> dict[str, bytes]:
     """All of them, by name."""
     solver = Solver(Options(mode="all-batch"))
-    reports, changed = [], []
+    steps, reports, changed = [], [], []
     for batch, settle in ((first(), False), (second(), False), (third(), True)):
         solver.stage(batch)
-        reports.append(_short(solver.step(settle)))
+        steps.append(solver.step(settle))
+        reports.append(_short(steps[-1]))
         changed.append(_variables(solver.changed()))
     variables, factors = solver.graph()
     graph = MapGraph(EPOCH, 3, Batch(_variables(variables), tuple(_factors(factors))))
@@ -69,6 +71,7 @@ def messages() -> dict[str, bytes]:
         "estimate": codec.encode_estimate(Estimate(EPOCH, 3, graph.batch.variables)),
         "graph": codec.encode_graph(graph),
         "graph_ids": codec.encode_graph(_without_the_false_one()),
+        "history": _history(steps),
         "chi2": codec.encode_chi2(Chi2(EPOCH, 3, chi2)),
         "chi2_batch": codec.encode_chi2(Chi2(EPOCH, 3, chi2, optimum.chi2, "w1", _SECONDS)),
         "job": codec.encode_job(Job("j1", "batch", rounded(codec.encode_graph(graph)))),
@@ -79,6 +82,14 @@ def messages() -> dict[str, bytes]:
         **_about_uncertainty(solver, reports[2]),
     }
     return {name: data if name.startswith(("insert", "ask")) else rounded(data) for name, data in made.items()}
+
+
+def _history(reports: list[Any]) -> bytes:
+    """The three steps."""
+    chi2, eliminated, changed = (
+        np.array([getattr(report, name) for report in reports]) for name in ("chi2", "eliminated", "changed")
+    )
+    return encode_step_history(StepHistory(EPOCH, 3, np.arange(1, 4), chi2, np.full(3, _MS), eliminated, changed))
 
 
 def first() -> Batch:

@@ -72,6 +72,8 @@ _COLUMNS |= {"stamps": "i64", "box": "f64"}
 _COLUMNS |= {"chain": "u8", "named": "i64"}
 # Of closures that are tested, §20.
 _COLUMNS |= {"chance": "f64"} | dict.fromkeys(("tried", "came", "changed"), "i64")
+# Of the steps that a map has made, §8.
+_COLUMNS |= {"revisions": "i64", "eliminated": "i64", "chi2": "f64", "step_ms": "f64"}
 _CUTS = (slice(None, -1), slice(-1, None))
 
 

@@ -107,6 +107,27 @@ def test_the_recording_has_every_step_and_the_map_at_the_end(
     assert done[-1].report["because"] in found["/log"][done[-1].revision]["TextLog:text"][0]
 
 
+def test_the_plots_begin_with_the_steps_before_the_viewer_came(
+    endpoint: str, spawn: Callable[..., Process], tmp_path: Path
+) -> None:
+    path, steps = tmp_path / "late.rrd", list(city_trees(poses=80, seed=2))
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("late") as joined:
+        before = [joined.insert(step.batch) for step in steps[:60]]
+        history = joined.ask.history(None).result()
+        assert {step.revision for step in before} <= set(history.revisions.tolist())
+        watcher = spawn("-m", "factorbus.cli", "watch", "late", "--connect", endpoint, "--save", str(path))
+        watcher.ready()
+        after = [joined.insert(step.batch) for step in steps[60:]]
+        joined.wait_converged(60)
+        watcher.signal(signal.SIGINT)
+        assert watcher.wait() == OK
+    found = rows(path)
+    for name in ("chi2", "step_ms", "eliminated", "changed"):
+        plot = {revision: row["Scalars:scalars"] for revision, row in found[f"/plots/{name}"].items()}
+        for step in (*before, *after):
+            assert plot[step.revision] == [step.report[name]], f"{name} of {step.revision}, once"
+
+
 def test_the_log_says_while_a_map_is_converging(endpoint: str, spawn: Callable[..., Process], tmp_path: Path) -> None:
     path, poses = tmp_path / "turned.rrd", 1000
     with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("turning", "all-batch") as joined:

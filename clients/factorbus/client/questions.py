@@ -16,6 +16,7 @@ from factorbus.proto.interest_codec import filter_map
 from factorbus.proto.messages import Chi2, Estimate, MapGraph
 from factorbus.proto.problems import BadMessage
 from factorbus.proto.repair_codec import decode_repaired, encode_ask_repair
+from factorbus.proto.step_history import StepHistory, decode_step_history
 
 T = TypeVar("T")
 log = logging.getLogger("factorbus.client")
@@ -58,6 +59,10 @@ class Questions:
     def stats(self, timeout_s: float | None) -> Future[dict[str, Any]]:
         """What the service counts and times about the map."""
         return self._ask("stats", codec.encode_map({}), codec.decode_map, timeout_s)
+
+    def history(self, timeout_s: float | None) -> Future[StepHistory]:
+        """χ², time and work of the steps since the service has opened the map, the more sparsely the longer ago."""
+        return self._ask("history", codec.encode_map({}), decode_step_history, timeout_s)
 
     def export(
         self,

@@ -15,6 +15,7 @@ import rerun.blueprint as rrb
 
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta
+from factorbus.proto.step_history import StepHistory
 from factorbus.viz import style
 from factorbus.viz.closures import closures_of, colours_of
 from factorbus.viz.ellipses import outlines
@@ -41,6 +42,7 @@ class LiveView:
         self._map = map_name
         self._to = rr.RecordingStream("factorbus", recording_id=f"{map_name}-{os.urandom(4).hex()}")
         self._drawn_at, self._framed_m = -1e9, 0.0
+        self._filled = (0, 0)  # epoch and revision up to which the plots have what the map's history said
         self._viewer: Viewer | None = None  # for browsers; a window of this display stays when we go
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -78,6 +80,15 @@ class LiveView:
             self._log_map(look, track)
             self._frame(track)
 
+    def show_history(self, history: StepHistory) -> None:
+        """Fill the plots with the steps before we came; those steps are not logged again when their deltas come."""
+        revisions = rr.TimeColumn("revision", sequence=history.revisions)
+        for name in _PLOTS:
+            numbers = np.asarray(getattr(history, name), np.float64)
+            if len(numbers):
+                self._to.send_columns(f"plots/{name}", [revisions], rr.Scalars.columns(scalars=numbers))
+        self._filled = (history.epoch, history.revision)
+
     def close(self) -> None:
         """Hand over what is still here."""
         self._to.flush(timeout_sec=10.0)
@@ -99,7 +110,7 @@ class LiveView:
 
     def _log_step(self, delta: Delta, now: float) -> None:
         self._at(delta.revision, now)
-        for name in _PLOTS:
+        for name in _PLOTS if self._is_new(delta) else ():
             if name in delta.report:
                 self._to.log(f"plots/{name}", rr.Scalars(float(delta.report[name])))
         if "strategy" in delta.report:  # that of a part of the map says less
@@ -110,6 +121,11 @@ class LiveView:
                 text += f"; {deferred} and more left for later steps"
             far = delta.report.get("converged") is False
             self._to.log("log", rr.TextLog(text, level="WARN" if far else "INFO"))
+
+    def _is_new(self, delta: Delta) -> bool:
+        """Whether the plots do not have it yet."""
+        epoch, revision = self._filled
+        return delta.epoch != epoch or delta.revision > revision
 
     def _log_map(self, look: Look, track: Track) -> None:
         letters = track.keys >> _LETTER_BITS

@@ -1,4 +1,4 @@
-"""Graph files in and out: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL and TUM text are read,
+"""Graph files in and out: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL and TUM text and GLIM's maps are read,
 g2o, PyFactorGraph, JRL, TUM and KITTI are written.
 
 `read` gives a `GraphFile`: the whole graph as one `Batch`, and its replay as one `Batch` a pose, in time order.
@@ -7,6 +7,7 @@ g2o, PyFactorGraph, JRL, TUM and KITTI are written.
 from factorbus.formats.errors import FormatError
 from factorbus.formats.graph import GraphFile
 from factorbus.formats.numbering import IDS
+from factorbus.formats.read_glim import is_glim
 from factorbus.formats.reader import READS, read
 from factorbus.formats.robot_log import FactorLabels, RobotLog
 from factorbus.formats.steps import Steps
@@ -33,6 +34,7 @@ __all__ = [
     "as_jrl",
     "as_pyfg",
     "g2o_text",
+    "is_glim",
     "kitti_text",
     "read",
     "recoded",

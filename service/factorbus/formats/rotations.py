@@ -116,6 +116,20 @@ def rotation_matrices(poses: F64) -> F64:
     return np.stack(columns, axis=2)
 
 
+def quats_of_matrices(R: F64) -> F64:
+    """Quaternions (n, 4), qx qy qz qw, of rotation matrices (n, 3, 3): each by the largest of its components."""
+    x, y, z = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
+    squares = np.stack([1 + x - y - z, 1 - x + y - z, 1 - x - y + z, 1 + x + y + z], axis=1)
+    largest = squares.argmax(axis=1)
+    columns = np.zeros((len(R), 4, 4))  # 4 qᵢ qⱼ
+    columns[:, range(4), range(4)] = squares
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        columns[:, i, j] = columns[:, j, i] = R[:, i, j] + R[:, j, i]
+        columns[:, 3, k] = columns[:, k, 3] = R[:, j, i] - R[:, i, j]
+    quat = columns[np.arange(len(R)), largest]
+    return quat / np.linalg.norm(quat, axis=1, keepdims=True)
+
+
 def _roll_pitch_yaw(quat: F64) -> F64:
     x, y, z, w = quat.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))

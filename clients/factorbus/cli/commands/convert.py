@@ -48,8 +48,8 @@ def command(
     ground_truth: bool,
     as_json: bool,
 ) -> None:
-    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg, JRL .jrl or .jrl.cbor, BAL or TUM text) and
-    write TARGET (.g2o, .pyfg, .jrl, .jrl.cbor, .tum or .kitti, by its ending).
+    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg, JRL .jrl or .jrl.cbor, BAL or TUM text, or the
+    folder of a map that GLIM has saved) and write TARGET (.g2o, .pyfg, .jrl, .jrl.cbor, .tum or .kitti, by its ending).
 
     What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
     letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum. A .tum has each pose's time stamp.
@@ -62,6 +62,7 @@ def command(
     factorbus convert ntu.jrl truth.tum --ground-truth
     factorbus convert ntu.jrl ntu.jrl.cbor
     factorbus convert two-robots.g2o a.tum --robot a
+    factorbus convert dump map.g2o
     factorbus convert edges.txt edges.g2o --dialect slam++
     """
     if target.suffix not in _WRITES:

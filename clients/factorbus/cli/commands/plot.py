@@ -21,8 +21,8 @@ _FROM_BUS = "SOURCE is a map of the service at ENDPOINT."
 def command() -> None:
     """Draw into a .png, .svg or .pdf file, in colours that colour-blind readers can tell apart.
 
-    SOURCE is a graph file (g2o, TORO, iSAM, SLAM++, pyfg, JRL), the name of a data set, or with --connect the name of a
-    map on the bus. What of a file is left out is said.
+    SOURCE is a graph file (g2o, TORO, iSAM, SLAM++, pyfg, JRL), a map of GLIM's, the name of a data set, or with
+    --connect the name of a map on the bus. What of a file is left out is said.
 
     \b
     factorbus plot map town.g2o --solve

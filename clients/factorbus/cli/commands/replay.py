@@ -125,7 +125,8 @@ class ReplayRequest:
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
     """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, BAL, or a data set's name) through a map, pose by pose.
-    Or a folder with a log of an IMU and GNSS, odometry or poses (EuRoC's mav0, KITTI raw, GTSAM's KITTI).
+    Or the folder of a map that GLIM has saved, or one with a log of an IMU and GNSS, odometry or poses (EuRoC's mav0,
+    KITTI raw, GTSAM's KITTI).
 
     Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
     there after every step. What FILE fixes holds the map in place, or its priors; without either the pose of the lowest

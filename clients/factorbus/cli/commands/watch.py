@@ -2,9 +2,10 @@
 
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,6 +21,9 @@ from factorbus.cli.process.options import (
     zenoh_option,
 )
 from factorbus.wording import counted
+
+if TYPE_CHECKING:
+    from factorbus.client import Map
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +79,8 @@ def command(
     """Watch MAP live in Rerun: trajectory, landmarks, loop closures by how badly they fit, and plots of every step.
 
     Opens the Rerun viewer; where there is no display, serves it to browsers of this machine, or with --host and
-    --insecure to all who can reach that address. A map that is not there yet is waited for. Until Ctrl-C.
+    --insecure to all who can reach that address. A map that is not there yet is waited for. The plots begin with the
+    steps that the service has made since it opened the map. Until Ctrl-C.
 
     --only, --kind, --box, --period-ms and --bytes-per-s follow a part of the map, for a radio link: the service sends
     that part alone. Factors and ellipses are not asked for then; what waits for the link is said.
@@ -111,6 +116,8 @@ def command(
         try:
             where = _open(view, viewer)
             with MapFollower(joined, not interest, 0 if interest else ellipses) as follower:
+                if not interest:  # of which a radio link carries no more than is asked for
+                    _fill_plots(view, joined)
                 view.show(follower.last_look(joined.timeout_s))
                 click.echo(f"ready {where}")
                 while not stop.wait(1 / rate) and (until is None or joined.estimate.revision < until):
@@ -125,6 +132,14 @@ def command(
     if interest:
         told = f"; {counted(joined.estimate.waiting, 'variable')} waiting" if joined.estimate.waiting else ""
         print_note(f"its part came in {joined.estimate.received_bytes:,} bytes{told}")
+
+
+def _fill_plots(view: Any, joined: "Map") -> None:
+    """With the steps that the map has made until now; an older service does not have them."""
+    from factorbus.proto.problems import Problem
+
+    with suppress(Problem):
+        view.show_history(joined.ask.history(None).result())
 
 
 def _open(view: Any, viewer: ViewOptions) -> str:

@@ -30,7 +30,7 @@ def source_of(given: Path, places: Places | None = None, catalogue: Sequence[Dat
         raise Stopped(
             "bad_file",
             f"{given}: no such file, and no data set of that name; wanted a g2o, TORO, iSAM, SLAM++, "
-            f"PyFactorGraph or JRL file, a recording (.mcap, .bag, rosbag2), "
+            f"PyFactorGraph or JRL file, a map of GLIM's, a recording (.mcap, .bag, rosbag2), "
             f"or one of {', '.join(dataset.name for dataset in catalogue)}",
             BAD_FILE,
             path=str(given),

@@ -6,12 +6,12 @@ from pathlib import Path
 from factorbus.cli.logs.euroc import read_euroc
 from factorbus.cli.logs.kitti import GPS, IMU, OXTS, read_gtsam_kitti, read_oxts
 from factorbus.cli.logs.sensor_log import SensorLog
-from factorbus.formats import FormatError
+from factorbus.formats import FormatError, is_glim
 
 
 def is_log(path: Path) -> bool:
-    """Whether it is a folder, or one of the two files of GTSAM's KITTI drive."""
-    return path.is_dir() or (path.name in (IMU, GPS) and path.exists())
+    """Whether it is a folder, of no graph, or one of the two files of GTSAM's KITTI drive."""
+    return (path.is_dir() and not is_glim(path)) or (path.name in (IMU, GPS) and path.exists())
 
 
 def read_log(path: Path) -> SensorLog:
@@ -30,5 +30,8 @@ def _read(path: Path) -> SensorLog:
             return read_oxts(each)
     if (folder / IMU).exists() or (folder / GPS).exists():
         return read_gtsam_kitti(folder)
-    wanted = f"EuRoC's mav0/imu0, KITTI's {OXTS}/timestamps.txt and {OXTS}/data, {IMU} and {GPS}, or a rosbag2 folder"
+    wanted = (
+        f"EuRoC's mav0/imu0, KITTI's {OXTS}/timestamps.txt and {OXTS}/data, {IMU} and {GPS}, a rosbag2 folder, or the "
+        "graph.txt and submaps of a map that GLIM has saved"
+    )
     raise FormatError(str(path), None, "a folder without a log or a recording that is known", wanted)

@@ -125,8 +125,8 @@ class Stepped(NamedTuple):
 
     converged, unfinished: if not, or if so, further steps are to follow when no insert does.  changed: how many
     variables; damping: what the next step would begin with.  further: without an insert, because the map was not at its
-    optimum.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.  step_ms: what its budget
-    is for, of solver_ms; use: None where it had none.
+    optimum.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.  step_ms: what a budget
+    is for, of solver_ms; use: of its budget, None where it had none.  eliminated: how many variables, each time it was.
     """
 
     revision: int
@@ -142,6 +142,7 @@ class Stepped(NamedTuple):
     unfinished: bool = False
     step_ms: float = 0.0
     use: BudgetUse | None = None
+    eliminated: int = 0
 
 
 class Applied(NamedTuple):

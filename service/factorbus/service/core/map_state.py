@@ -44,6 +44,7 @@ from factorbus.service.core.events import (
     Verdict,
     reproducible_fields,
 )  # fmt: skip
+from factorbus.service.core.kept_steps import KeptSteps
 from factorbus.service.core.pending_questions import Reads, is_graft
 from factorbus.service.core.removals import IdleRemovals
 from factorbus.service.core.short_batches import ShortBatches
@@ -76,7 +77,7 @@ class MapCore:
         self._closing: Problem | None = None
         self._since_snapshot = [0, 0]  # steps, bytes of deltas
         self._solver_cpu_s = 0.0
-        self._statistics = MapStatistics()
+        self._statistics, self._steps = MapStatistics(), KeptSteps()
         self._converging = Converging()
         self._moved_at = 0  # the revision of the last step that was not a further one
 
@@ -130,6 +131,8 @@ class MapCore:
             return [Refuse(arrived.asker, problem)]
         if question.name == "stats":
             return [Tell(arrived.asker, self.stats(now))]
+        if question.name == "history":
+            return [self._steps.answer(arrived.asker, self.epoch, self.revision)]
         if question.name == "interest":
             return [Follow(arrived.asker, question.ask, self.row())]
         return self.read(Read(question, arrived.asker), now)
@@ -160,13 +163,12 @@ class MapCore:
     def alone(self, alone: SingleInsertResult, answered: Asker) -> list[Effect]:
         """One insert was applied by itself; `answered` has its answer, and the delta is published."""
         (insert, answer, _), stepped, applied = alone
-        size = len(stepped.delta)
         others = self._admission.answer(insert, answer, answered)
         self._unanswered -= 1
         self._unanswered_bytes -= insert.size
         step = stepped.strategy, stepped.chi2, stepped.solver_ms
-        self._statistics.note(InsertDone(*step, applied.now - insert.now, len(answer), size))
-        self._moved_on(stepped.revision, size)
+        self._statistics.note(InsertDone(*step, applied.now - insert.now, len(answer), len(stepped.delta)))
+        self._moved_on(stepped)
         self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2, stepped.use)
         self._moved_at = stepped.revision
         self._budget.stepped(stepped)
@@ -217,9 +219,8 @@ class MapCore:
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
-        size = len(stepped.delta)
-        self._statistics.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, size)
-        self._moved_on(stepped.revision, size)
+        self._statistics.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, len(stepped.delta))
+        self._moved_on(stepped)
         self._budget.stepped(stepped)
         if stepped.further:
             self._converging.went_on(stepped)
@@ -239,10 +240,11 @@ class MapCore:
         self.removals.ended(1, now)
         return [*effects, *closures_moved(closures, self.epoch, self.revision)]
 
-    def _moved_on(self, revision: int, delta_bytes: int) -> None:
-        self.revision = revision
+    def _moved_on(self, stepped: Stepped) -> None:
+        self.revision = stepped.revision
+        self._steps.add(stepped)
         self._since_snapshot[0] += 1
-        self._since_snapshot[1] += delta_bytes
+        self._since_snapshot[1] += len(stepped.delta)
         steps, size = self._since_snapshot
         if steps >= self._limits.snapshot_steps or size >= self._limits.snapshot_bytes:
             self._since_snapshot = [0, 0]

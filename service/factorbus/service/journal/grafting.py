@@ -187,8 +187,8 @@ class _Grafting:
         ids = [entry.first_factor for record in own for entry in record.entries if entry.first_factor >= 0]
         first, moved = min(ids, default=0), False
         for record in own:
-            # Verdicts on closures, and which poses are redundant, are of the map as it was: closures are judged with the
-            # next insert, poses looked at when the map is idle.
+            # Verdicts on closures, and which poses are redundant, are of the map as it was: closures are judged with
+            # the next insert, and poses are looked at when the map is idle.
             own_inserts = [entry for entry in record.entries if entry.client not in OWN_CLIENTS]
             entries = [entry for entry in own_inserts if not self._is_there(entry, there)]
             if not entries and not record.further:

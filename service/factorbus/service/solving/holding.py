@@ -195,7 +195,7 @@ class Holding:
         delta = self._messages.write_delta(self._step(0), reported, everything, graph)
         strategy, solver_ms = str(reported.get("strategy", "")), float(reported.get("solver_ms", 0.0))
         made = Stepped(self._revision, delta, strategy, self.chi2(), solver_ms)
-        return made._replace(converged=self._converged, unfinished=self._unfinished)
+        return made._replace(converged=self._converged, unfinished=self._unfinished, **_kept_of(reported))
 
     def memory_bytes(self) -> int:
         """What its solver has in use."""
@@ -218,7 +218,8 @@ class Holding:
         reported = self._last_report
         told = reported["strategy"], reported["chi2"], reported["solver_ms"]
         made = Stepped(self._revision, delta, *told, converged=self._converged, unfinished=self._unfinished)
-        return made._replace(step_ms=reported["step_ms"], use=use_of(reported)) if "budget" in reported else made
+        made = made._replace(**_kept_of(reported))
+        return made._replace(use=use_of(reported)) if "budget" in reported else made
 
     def _next(self, reported: dict[str, Any]) -> None:
         """The solver has made a step: `reported` says, too, whether more are to follow."""
@@ -284,6 +285,12 @@ class Holding:
         if not any(self._accepted_counts):
             return None
         return report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
+
+
+def _kept_of(reported: Mapping[str, Any]) -> dict[str, Any]:
+    """What else is kept of a step, for its map's history."""
+    counts = {name: int(reported.get(name, 0)) for name in ("changed", "eliminated")}
+    return {"step_ms": float(reported.get("step_ms", 0.0)), **counts}
 
 
 def _has_converged(reported: Mapping[str, Any]) -> bool:
