@@ -5,8 +5,7 @@
                                     (solver thread)     └─▶ InsertBatch       what came in meanwhile; nothing did, and
                                                                               it is not at its optimum: a further step
 
-At most one InsertBatch is out at a time, so what the solver does next is decided when it is free, from all that waits
-then.
+At most one InsertBatch is out at a time: what the solver does next is decided when it is free, from all that waits.
 """
 
 import math
@@ -69,7 +68,7 @@ class MapCore:
         self._limits, self._created = limits, now
         self._admission = Admission(epoch, limits)
         self.check_numbers = self._admission.check_numbers
-        self._reads = Reads()
+        self._reads, self._converging = Reads(), Converging()
         self._running: InsertBatch | None = None
         self._unanswered = self._unanswered_bytes = 0  # given to the solver, and not answered
         self._must_reload = self._drained = False
@@ -78,7 +77,6 @@ class MapCore:
         self._since_snapshot = [0, 0]  # steps, bytes of deltas
         self._solver_cpu_s = 0.0
         self._statistics, self._steps = MapStatistics(), KeptSteps()
-        self._converging = Converging()
         self._moved_at = 0  # the revision of the last step that was not a further one
 
     def row(self) -> dict[str, Any]:

@@ -6,8 +6,8 @@
        insert, of the client `JUDGE`: they are what the journal has, and what is applied when it is run again
     3  verdicts that move closures then are a step, as any change is; then the insert is answered
 
-A closure that is out keeps its id and is in the ledger alone.  A user's `accept` and `reject` are final.  What an
-insert with changes adds is not tested: a person sends it.
+A closure that is out keeps its id, in the ledger alone.  A user's `accept` and `reject` are final.  What changes add
+is not tested: a person sends it.
 """
 
 import logging
