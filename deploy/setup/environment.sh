@@ -34,13 +34,13 @@ try_cholmod() {
 # PYTHON where it is given, else the first of the usual names that is new enough.
 interpreter() {
     local name
-    for name in ${PYTHON:-python3 python3.13 python3.12 python3.11}; do
+    for name in ${PYTHON:-python3 python3.14 python3.13 python3.12 python3.11}; do
         if command -v "$name" >/dev/null && "$name" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
             command -v "$name"
             return 0
         fi
     done
-    echo "set-up: found no Python 3.11 or newer (looked for: ${PYTHON:-python3 python3.13 python3.12 python3.11});" \
+    echo "set-up: found no Python 3.11 or newer (looked for: ${PYTHON:-python3 python3.14 python3.13 python3.12 python3.11});" \
         "install one, or name it: make setup PYTHON=/path/to/python3.12" >&2
     return 1
 }

@@ -10,7 +10,7 @@ from tests.solver.test_jit import kernels, run
 
 from factorbus.solver.kernels.jit import compile as _jit
 from factorbus.solver.kernels.jit import disk
-from factorbus.solver.kernels.jit.stamps import stamp_of
+from factorbus.solver.kernels.jit.stamps import _of_value, stamp_of
 
 __all__ = ["kernels"]
 
@@ -192,3 +192,11 @@ def twice(x: float) -> float:
 
 def thrice(x: float) -> float:
     return 3.0 * x
+
+
+def test_slices_count_by_their_ends() -> None:
+    """From Python 3.14 on `x[1:3]` has one among the constants of its bytecode."""
+    spans = (slice(1, 3), slice(1, 4), slice(0, 3), slice(1, 3, 2), slice(None, 3), (1, 3, None))
+    known = [_of_value("span", span, set(), []) for span in spans]
+    assert len(set(known)) == len(spans)
+    assert _of_value("span", slice(1, 3), set(), []) == known[0]

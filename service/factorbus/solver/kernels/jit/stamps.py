@@ -87,6 +87,8 @@ def _of_value(where: str, value: Any, names: set[str], called: list[Any]) -> str
         return _hash(kind, value.dtype.str, repr(value.shape), np.ascontiguousarray(value).tobytes().hex())
     if isinstance(value, tuple | list):
         return _hash(kind, *(_of_value(where, one, names, called) for one in value))
+    if isinstance(value, slice):  # a constant from Python 3.14 on
+        return _hash(kind, *(_of_value(where, one, names, called) for one in (value.start, value.stop, value.step)))
     if isinstance(value, set | frozenset):
         return _hash(kind, *sorted(_of_value(where, one, names, called) for one in value))
     if isinstance(value, Mapping):
