@@ -6,7 +6,7 @@ from itertools import islice, takewhile
 
 from factorbus.journal.records import JournalRecord
 from factorbus.journal.store import open_store
-from factorbus.proto.closures import count_inserts
+from factorbus.proto.own_clients import count_inserts
 from factorbus.service.journal.keeping import Keeper
 
 _MOST_RECORDS, _MOST_BYTES = 4096, 4 << 20
