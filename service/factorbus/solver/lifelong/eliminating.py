@@ -54,19 +54,22 @@ class _Branch(NamedTuple):
 def try_eliminate(graph: FactorGraph, poses: list[int], rows: Sequence[int], joined: Joined) -> Eliminated | None:
     """Without these poses; rows: of all their factors, which are relative ones; joined: neighbours of each variable.
 
-    None: it cannot be told, as no pose is among their neighbours, or these are not determined.
+    None: it cannot be told, as no pose is among their neighbours, or several fixed ones, or these are not determined.
     """
     whole = quadratic(graph, rows, poses)
     others = whole.variables[len(poses) :]
-    ends = [v for v in others if graph.var[v, at.V_KIND] in (at.SE2, at.SE3)]
-    if not ends:
+    fixed = sorted({v for row in rows for v in graph.ends_of(row)} - set(whole.variables))
+    ends = [*fixed, *(v for v in others if graph.var[v, at.V_KIND] in (at.SE2, at.SE3))]
+    if not ends or len(fixed) > 1:
         return None
-    if len(others) == 1:
+    if len(fixed) + len(others) == 1:
         return Eliminated([], 0.0)
     try:
         information, eta = reduced(graph, whole, len(poses))
-        starts = {v: whole.starts[v] - whole.starts[others[0]] for v in others}
-        # Where the whole of them is nobody says, so the first stays where it is.
+        more = sum(kind_of(graph, v).dim for v in fixed)
+        information, eta = np.pad(information, (more, 0)), np.pad(eta, (more, 0))
+        starts = {v: whole.starts[v] - whole.starts[others[0]] + more for v in others} | dict.fromkeys(fixed, 0)
+        # One stays where it is: what is fixed, or where nobody says where the whole of them is, the first.
         free = np.arange(kind_of(graph, ends[0]).dim) + starts[ends[0]]
         free = np.setdiff1d(np.arange(eta.size), free)
         root = np.linalg.cholesky(information[np.ix_(free, free)])

@@ -1,8 +1,8 @@
 """Which poses a map has enough of: those that have others around them, but for what has to stay.
 
 A pose stays that is fixed, is one of the newest of its letter, has a factor other than a relative pose or the position
-of a landmark, is next to something fixed, or sees a landmark that too few see.  Of the others the oldest stay: front
-ends know them, and find them again.
+of a landmark that is estimated, or sees a landmark that too few see.  Of the others the oldest stay: front ends know
+them, and find them again.
 """
 
 from itertools import product
@@ -25,7 +25,8 @@ _SEEN = [at.FACTOR_CODES[name] for name in ("landmark_se2", "landmark_se3")]
 class Redundant(NamedTuple):
     """poses (n,): variables, the newest first.
 
-    rows (m,): of relative factors between what is estimated; ends (m, 2): their variables.
+    rows (m,): of relative factors between what is estimated, or between such a pose and a fixed one; ends (m, 2): of
+    each its variables.
     """
 
     poses: I64
@@ -39,7 +40,8 @@ def find_redundant(graph: FactorGraph, policy: KeepPolicy, staying: I64) -> Redu
     var, fac = graph.var[:n], graph.fac[:m]
     ends, free = fac[:, at.F_I : at.F_J + 1], var[:, at.V_COLUMN] >= 0
     relative = np.isin(fac[:, at.F_KIND], _BETWEEN + _SEEN) & ~are_of_many(fac)
-    relative[relative] = free[ends[relative]].all(axis=1)
+    held = ~free[ends[relative]]
+    relative[relative] = ~held.any(axis=1) | (np.isin(fac[relative, at.F_KIND], _BETWEEN) & ~held.all(axis=1))
     may_go = free & np.isin(var[:, at.V_KIND], list(_DIMENSIONS)) & ~np.isin(graph.keys[:n], staying)
     others = ends[~relative].ravel()
     may_go[others[others >= 0]] = False
