@@ -71,17 +71,16 @@ class TestedMapSolver(MapSolver):
         self, make_solver: Callable[[], Any], epoch: int, limits: Limits, options: Mapping[str, Any] | None = None
     ) -> None:
         super().__init__(make_solver, epoch, limits, options)
-        self._judge, self._replaying = ClosureJudge(), False
-        self._testing: _Testing | None = None
+        self._judge, self._replaying, self._testing = ClosureJudge(), False, None
         self._begin_anew()
-
-    def _has_new(self) -> bool:
-        return any(ledger.unjudged().size for ledger in self._ledger.of_kind.values())
 
     def _begin_anew(self) -> None:
         self._ledger, self._forest = ClosureLedger(), TrustedForest()
         self._entries = 0  # verdicts that were entered since
         self._left_new = False  # closures came without verdicts on them, as those of a replica that went back
+
+    def _has_new(self) -> bool:
+        return any(ledger.unjudged().size for ledger in self._ledger.of_kind.values())
 
     # ---- as of any map solver ---------------------------------------------------------------------------------------
 
