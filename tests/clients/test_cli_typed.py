@@ -69,6 +69,14 @@ def test_is_wrong_use_and_says_why(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("option", ["--upstream", "--journal", "--name"])
+def test_an_option_of_serve_that_is_empty_is_not_taken_for_none(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["serve", option, ""]) == USAGE
+    assert f"{option} is empty; give a value, or leave the option out" in capsys.readouterr().err
+
+
 def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, full = tmp_path / "town.g2o", {name: tmp_path / f"full.{name}" for name in ("g2o", "tum", "svg")}
     assert main(["simulate", "manhattan", "--poses", "20", "--out", str(source)]) == OK

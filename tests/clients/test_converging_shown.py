@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ from faulty.service import MAP, Service, endpoint_in
 
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import OK, REFUSED
+from factorbus.client.bus import Bus
+from factorbus.client.map_row import MapRow
 
 _HISTOGRAM = {"bounds_s": [1.0], "counts": [0, 0], "sum_s": 0.0}
 _ROW = {
@@ -55,6 +58,18 @@ def said(service: Service, folder: Path, how: dict[str, Any], capsys: pytest.Cap
 )
 def test_top(service: Service, tmp_path: Path, how: dict[str, Any], wanted: str, capsys: Any) -> None:
     assert wanted in said(service, tmp_path, how, capsys, "top", "--once", "--every", "0.1")
+
+
+def test_maps_says_how_a_map_is_kept(
+    service: Service, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = MapRow("cellar", "bayes-tree", 7, 3, 2, 1)
+    kept = replace(plain, name="hall", closures="test", budget_ms=10.0, keep="per_area=2:1,window=50")
+    monkeypatch.setattr(Bus, "maps", lambda _: [plain, kept])
+    assert main(["maps", "--connect", endpoint_in(tmp_path)]) == OK
+    shown = " ".join(capsys.readouterr().out.split())
+    assert shown.count("closures tested, steps of 10 ms, keep per_area=2:1,window=50") == 1
+    assert shown.count("mode ") == 2
 
 
 def test_top_as_a_document(service: Service, tmp_path: Path, capsys: Any) -> None:

@@ -16,6 +16,7 @@ import pytest
 import factorbus
 from factorbus.client.pending_insert import PendingInsert
 from factorbus.ownership import UnsafeFolder
+from factorbus.proto.arrays import F64, I64
 from factorbus.proto.problems import Problem, Refused
 from factorbus.solver.errors import Diverged, OutOfBounds, SolverError
 
@@ -44,7 +45,7 @@ def sample(hint: Any) -> Any:
         return tuple(map(sample, arguments))
     if origin in (tuple, list, Sequence, Iterable):
         return (tuple if origin is tuple else list)([sample(arguments[0])] * 2)
-    if origin is np.ndarray:
+    if origin is np.ndarray or hint in (F64, I64):
         return np.arange(2)
     if origin in (dict, Mapping):
         return {sample(arguments[0]): sample(arguments[1])}

@@ -47,4 +47,6 @@ def _shown(row: "MapRow") -> str:
     blocked = "; blocked: its journal cannot be written" if row.state == "blocked" else ""
     held = f"{counted(row.variables, 'variable')}, {counted(row.factors, 'factor')}"
     caveat = "" if row.reproducible is not False else "; not reproducible"
-    return f"{held}, revision {row.revision:,}, mode {row.mode}{caveat}{blocked}"
+    policies = ["closures tested"] * (row.closures == "test") + [f"steps of {row.budget_ms:g} ms"] * bool(row.budget_ms)
+    policies += [f"keep {row.keep}"] * (row.keep != "all")
+    return ", ".join([f"{held}, revision {row.revision:,}, mode {row.mode}", *policies]) + caveat + blocked

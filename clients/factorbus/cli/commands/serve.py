@@ -130,8 +130,10 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
 def _settings(path: Path | None, given: dict[str, Any]) -> Any:
     from dataclasses import replace
 
-    from factorbus.service.config import Config, checked_config, load_config, needs_journal
+    from factorbus.service.config import BadConfig, Config, checked_config, load_config, needs_journal
 
+    if empty := [name for name, value in given.items() if value == ""]:  # a variable of the shell that is not set, say
+        raise BadConfig(f"--{empty[0].replace('_', '-')} is empty; give a value, or leave the option out")
     given = {name: value for name, value in given.items() if value is not None and value != ()}
     if path is None:
         config = checked_config(replace(Config(), **given))
