@@ -39,7 +39,7 @@ class Town:
 
 
 def town(poses: int, seed: int) -> Town:
-    """A way of so many metres."""
+    """A way of as many metres as `poses`."""
     return Town(true_poses(list(islice(walk_streets(Random(f"streets {seed}"), 5, straight=0.5), poses))), seed)
 
 

@@ -27,7 +27,7 @@ BATCHES = [step.batch for step in manhattan(400, 3)]
 
 
 class Kept:
-    """A map with a journal, which keeps within its policy every so many inserts."""
+    """A map with a journal, which keeps within its policy at intervals."""
 
     def __init__(self, folder: Path, closures: str = "trust") -> None:
         self.options = {"keep": KEEP, "closures": closures}

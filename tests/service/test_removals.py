@@ -20,7 +20,7 @@ IDLE = removals.KEEP_IDLE_S
 
 
 class Driven:
-    """A core whose clock stands unless it is moved, and a solver that says what it is told to say."""
+    """A core whose clock stands unless it is moved, and a solver that says what a test has it say."""
 
     def __init__(self, keep: str = POLICY, here: bool = True) -> None:
         self.core = MapCore("m", "auto", 5, Limits(), now=0.0, removals=IdleRemovals(keep, here))
@@ -51,7 +51,7 @@ class Driven:
         return self.core.tick(self.now)
 
     def looked(self, planned: Planned, answer: Any = b"ok") -> tuple[list[Effect], list[Effect]]:
-        """What the solver found, and did: what is told, and what is done next."""
+        """What the solver found and did, what goes out, and what is done next."""
         self.core.removals.planned(planned)
         own = Arrived([], KEEPER, self.revision + 1, 0, 10, 1, Insert(1, Batch()), 0.0)
         told = self.stepped((own,), answer) if planned.poses else []

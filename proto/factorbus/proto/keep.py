@@ -1,7 +1,7 @@
 """What a map keeps of places that are driven through again and again, as text: `per_area=2:1,window=50,landmarks=2`.
 
 per_area    M or M:N: of the poses within M metres of each other N stay (1)
-window      the newest poses of each letter stay, so many
+window      how many of the newest poses of each letter stay
 landmarks   a pose stays that sees a landmark which no more poses than so see
 loss        the most that may be lost for each pose that goes, nats
 
@@ -20,7 +20,7 @@ _MOST = {"poses": 1000, "window": 10**9, "landmarks": 10**9}
 
 
 class KeepSettings(NamedTuple):
-    """per_area_m, poses: so many poses stay within this distance of each other, metres.  window, landmarks, loss: as
+    """per_area_m, poses: how many poses stay within this distance of each other, metres.  window, landmarks, loss: as
     above."""
 
     per_area_m: float

@@ -163,7 +163,7 @@ def _sections(path: Path) -> list[_Section]:
 
 
 def _words(path: Path, section: Mapping[str, tuple[int, list[str]]], name: str, count: int) -> tuple[int, list[str]]:
-    """(line, the words that follow a name).  Raises FormatError unless there are so many."""
+    """(line, the words that follow a name).  Raises FormatError unless there are `count`."""
     if name not in section:
         raise FormatError(str(path), None, f"no {name}", f'a line "{name}:" and what it is, as GLIM writes it')
     line, words = section[name]

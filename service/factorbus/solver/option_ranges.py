@@ -100,3 +100,11 @@ def check_number(name: str, value: Any) -> None:
     """That it is in the range of the option of that name.  Raises BadOption."""
     if not (allowed := RANGES[name]).takes(value):
         raise BadOption(name, repr(value), str(allowed))
+
+
+def check_within(name: str, value: object, least: float, most: float, whole: bool = False) -> None:
+    """That a setting of a policy is from `least` to `most`, and no switch.  Raises BadOption."""
+    kinds = int if whole else (int, float)
+    if not isinstance(value, kinds) or isinstance(value, bool) or not least <= value <= most:
+        wanted = "a whole number" if whole else "a number"
+        raise BadOption(name, repr(value), f"{wanted} from {least:g} to {most:g}")

@@ -1,4 +1,4 @@
-"""The steps that a map has made since it was opened, for the plots of who comes late: so many, however many there were.
+"""Steps that a map has made since it was opened, for plots of who comes late: at most MOST_STEPS, whatever it has made.
 
 When there are too many, every second one of the older half goes.  So the newest are all there, and a long drive is
 there from its beginning, the more sparsely the longer ago.

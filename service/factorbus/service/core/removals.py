@@ -52,7 +52,7 @@ class IdleRemovals:
         return self._at_once or self._steps >= KEEP_STEPS or now - self._busy_at >= KEEP_IDLE_S
 
     def ended(self, inserts: int, now: float) -> None:
-        """The solver is done with so many inserts of clients."""
+        """The solver is done with `inserts` of clients."""
         if inserts:
             self._busy_at, self._steps = now, self._steps + 1
             self._wanted, self._failed = True, False
@@ -63,7 +63,7 @@ class IdleRemovals:
             self._busy, self._steps = True, 0
 
     def planned(self, planned: Planned) -> None:
-        """What it found; what goes is told later."""
+        """What it found; the verdict on what goes comes later."""
         self._planned, self._at_once = planned, planned.poses > 0
         self._wanted, self._failed = planned.poses > 0, planned.failed
         self._busy = planned.poses > 0

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from factorbus.solver.errors import BadOption
+from factorbus.solver.option_ranges import check_within
 
 _SHARES = (
     "closure_gate_probability", "closure_out_probability", "closure_chance_max",
@@ -41,18 +42,11 @@ class ClosurePolicy:
 
     def __post_init__(self) -> None:
         for name in _SHARES:
-            _check(name, getattr(self, name), _SURE, 1.0 - _SURE)
+            check_within(name, getattr(self, name), _SURE, 1.0 - _SURE)
         for name in ("closure_spread_m", "closure_spread_rad", "closure_place_m"):
-            _check(name, getattr(self, name), 1e-6, 1e6)
+            check_within(name, getattr(self, name), 1e-6, 1e6)
         for name in ("closure_revisits", "closure_retests"):
-            _check(name, getattr(self, name), 0, 10_000, whole=True)
+            check_within(name, getattr(self, name), 0, 10_000, whole=True)
         if self.closure_out_probability < self.closure_gate_probability:
             seen = f"{self.closure_out_probability:g} < {self.closure_gate_probability:g}"
             raise BadOption("closure_out_probability", seen, "closure_gate_probability or more")
-
-
-def _check(name: str, value: object, least: float, most: float, whole: bool = False) -> None:
-    kinds = int if whole else (int, float)
-    if not isinstance(value, kinds) or isinstance(value, bool) or not least <= value <= most:
-        wanted = "a whole number" if whole else "a number"
-        raise BadOption(name, repr(value), f"{wanted} from {least:g} to {most:g}")

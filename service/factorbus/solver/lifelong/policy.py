@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from factorbus.solver.errors import BadOption
+from factorbus.solver.option_ranges import check_within
 
 
 @dataclass(frozen=True, slots=True)
 class KeepPolicy:
-    """spacing_m, poses: so many poses stay within this distance of each other, metres; the others are redundant.
+    """spacing_m, poses: how many poses stay within this distance of each other, metres; the others are redundant.
 
     window: the newest poses of each letter, which stay.  landmarks: a pose stays that sees a landmark which no more
     poses than so see.  loss: the most that may be lost for each pose that goes, nats (`eliminating`).
@@ -22,15 +22,8 @@ class KeepPolicy:
     loss: float = 1.0
 
     def __post_init__(self) -> None:
-        _check("spacing_m", self.spacing_m, 1e-3, 1e6)
-        _check("poses", self.poses, 1, 1000, whole=True)
-        _check("window", self.window, 1, 10**9, whole=True)
-        _check("landmarks", self.landmarks, 1, 10**9, whole=True)
-        _check("loss", self.loss, 0.0, 1e6)
-
-
-def _check(name: str, value: object, least: float, most: float, whole: bool = False) -> None:
-    kinds = int if whole else (int, float)
-    if not isinstance(value, kinds) or isinstance(value, bool) or not least <= value <= most:
-        wanted = "a whole number" if whole else "a number"
-        raise BadOption(f"keep {name}", repr(value), f"{wanted} from {least:g} to {most:g}")
+        check_within("keep spacing_m", self.spacing_m, 1e-3, 1e6)
+        check_within("keep poses", self.poses, 1, 1000, whole=True)
+        check_within("keep window", self.window, 1, 10**9, whole=True)
+        check_within("keep landmarks", self.landmarks, 1, 10**9, whole=True)
+        check_within("keep loss", self.loss, 0.0, 1e6)

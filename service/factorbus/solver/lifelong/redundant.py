@@ -56,10 +56,10 @@ def find_redundant(graph: FactorGraph, policy: KeepPolicy, staying: I64) -> Redu
 
 
 def _newest(letters: I64, window: int) -> np.ndarray:
-    """(n,) Whether a pose is among the last so many of its letter; of one that others have left behind, the last alone.
+    """(n,) Whether a pose is among the newest `window` of its letter; of one left behind, the last alone.
 
     letters (n,): of poses in the order in which they came.  Left behind is a letter after whose last pose another one
-    has so many: it is not driven on, as that of a drive of yesterday, or stands still for long.
+    has that many: it is not driven on, as that of a drive of yesterday, or stands still for long.
     """
     order = np.argsort(letters, kind="stable")
     behind = np.empty(letters.size, np.int64)
