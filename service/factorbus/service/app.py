@@ -35,6 +35,7 @@ from factorbus.service.bus.senders import Senders
 from factorbus.service.bus.zenoh_session import (
     ServiceBus,
     UpstreamBus,
+    check_zenoh_files,
     ignore,
     key_of,
     open_service_bus,
@@ -87,6 +88,7 @@ def serve(
     several times a second: for a supervisor.  Raises BadConfig, Problem.
     """
     checked_config(config)
+    check_zenoh_files(config)
     # Who only waits for the folder has everything ready by then; who cannot have it says so before compiling.
     library = open_library(config, log_owner, stop) if config.journal and not config.standby else None
     try:

@@ -40,6 +40,7 @@ def work(config: WorkerConfig, on_ready: Callable[[str], None], stop: threading.
     `on_ready` gets the worker's name once it can be found.  Raises BadConfig, BadName.
     """
     checked_worker_config(config)
+    settings = _settings(config)  # a bad file is said before the kernels are compiled
     keep_freed_memory()
     from factorbus.solver import compile_seconds, warm, why_stock_numba
 
@@ -51,7 +52,7 @@ def work(config: WorkerConfig, on_ready: Callable[[str], None], stop: threading.
         seconds = sum(make(lambda name: _announce(name, compile_seconds())) for make in (warm, warm_idp))
         log.info("kernels ready after %.1f s", seconds)
     sys.setswitchinterval(0.0005)
-    session = _open(config, stop)
+    session = _open(config, settings, stop)
     if session is None:
         return
     try:
@@ -66,9 +67,8 @@ def _announce(kernels: str, compiled_s: float) -> None:
         log.info("compiling kernels: %s", kernels)
 
 
-def _open(config: WorkerConfig, stop: threading.Event) -> zenoh.Session | None:
+def _open(config: WorkerConfig, settings: zenoh.Config, stop: threading.Event) -> zenoh.Session | None:
     """A session, or None when `stop` was set before there was one."""
-    settings = _settings(config)
     pause = _FIRST_PAUSE_S
     while not stop.is_set():
         try:

@@ -8,7 +8,7 @@ and return, or at most reply and publish: while it runs, nothing more is heard o
 import json
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import zenoh
@@ -36,27 +36,21 @@ _PRIORITY = {
 }
 
 
+def check_zenoh_files(config: Config) -> None:
+    """Before anything is compiled, and an upstream tried again and again.  Raises BadConfig, as `open_service_bus`."""
+    _service_settings(config)
+    if config.upstream:
+        settings = _upstream_settings(config.upstream, config.upstream_zenoh)
+        if not config.insecure:
+            refuse_unsafe_keys(_reader(settings))
+
+
 def open_service_bus(config: Config) -> "ServiceBus":
     """The bus as `config` describes it.  Raises BadConfig; Exposed and UnsafeKeys are such.  Raises PortTaken,
     CannotListen.
     """
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)  # read by Zenoh when the first session of a process is opened
-    try:
-        settings = zenoh.Config.from_file(config.zenoh) if config.zenoh else zenoh.Config()
-        for path, value in zenoh_settings(config).items():
-            settings.insert_json5(path, json.dumps(value))
-    except zenoh.ZError as error:
-        # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
-        where = config.zenoh or "built in"
-        raise BadConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
-
-    def setting(path: str) -> Any:
-        return json.loads(settings.get_json(path))
-
-    if not config.insecure:
-        refuse_unsafe_keys(setting)
-        if config.mode != "client":
-            refuse_exposed(config.listen, setting)
+    settings = _service_settings(config)
     try:
         return ServiceBus(zenoh.open(settings))
     except zenoh.ZError as error:
@@ -66,6 +60,35 @@ def open_service_bus(config: Config) -> "ServiceBus":
         raise BadConfig(
             f"cannot open {where}: {redact.reason(error)}; is the address right, and its certificate there?"
         ) from None
+
+
+def _service_settings(config: Config) -> zenoh.Config:
+    settings = _settings(config.zenoh, zenoh_settings(config))
+    if not config.insecure:
+        refuse_unsafe_keys(_reader(settings))
+        if config.mode != "client":
+            refuse_exposed(config.listen, _reader(settings))
+    return settings
+
+
+def _upstream_settings(endpoint: str, zenoh_file: str) -> zenoh.Config:
+    return _settings(zenoh_file, upstream_settings(endpoint))
+
+
+def _settings(file: str, ours: Mapping[str, Any]) -> zenoh.Config:
+    try:
+        settings = zenoh.Config.from_file(file) if file else zenoh.Config()
+        for path, value in ours.items():
+            settings.insert_json5(path, json.dumps(value))
+    except zenoh.ZError as error:
+        # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
+        where = file or "built in"
+        raise BadConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
+    return settings
+
+
+def _reader(settings: zenoh.Config) -> Callable[[str], Any]:
+    return lambda path: json.loads(settings.get_json(path))
 
 
 class ServiceBus:
@@ -190,12 +213,7 @@ class UpstreamBus:
 
 def open_upstream_bus(endpoint: str, zenoh_file: str, see: Callable[[bool], None]) -> UpstreamBus:
     """A session with the service or router at `endpoint`.  Raises Unavailable, BadConfig."""
-    try:
-        settings = zenoh.Config.from_file(zenoh_file) if zenoh_file else zenoh.Config()
-        for path, value in upstream_settings(endpoint).items():
-            settings.insert_json5(path, json.dumps(value))
-    except zenoh.ZError as error:
-        raise BadConfig(f"Zenoh does not take {zenoh_file or 'this configuration'}: {redact.reason(error)}") from None
+    settings = _upstream_settings(endpoint, zenoh_file)
     try:
         return UpstreamBus(zenoh.open(settings), see)
     except zenoh.ZError as error:
