@@ -107,6 +107,20 @@ def test_into_a_running_service_with_inserts_in_flight(endpoint: str, local: dic
     assert windowed["steps"] <= POSES
     assert windowed["revision"] == windowed["steps"] + 1 == windowed["deltas"]
     assert windowed["chi2"] == pytest.approx(local["chi2"], rel=1e-6)
+    assert windowed["closure_states"] is local["closure_states"] is None
+
+
+def test_closures_that_are_tested_are_counted_at_the_end(
+    endpoint: str, town: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("--connect", endpoint, "--map", "tested", "--closures", "test")
+    assert main(["replay", str(town), *arguments]) == OK
+    with connect(endpoint, client="looks") as bus, bus.map("tested", create=False) as tested:
+        counts = tested.suspects().counts
+    assert sum(counts.values()) > 0
+    shown = re.search(r"closures +(\d+ accepted, .*)", capfd.readouterr().out)
+    assert shown is not None
+    assert shown[1].rstrip().split(", ") == [f"{count} {state}" for state, count in counts.items()]
 
 
 def test_a_map_that_is_not_empty_is_refused(endpoint: str, town: Path) -> None:

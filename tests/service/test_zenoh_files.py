@@ -1,6 +1,7 @@
 """A Zenoh configuration that cannot be is said at the start, whichever option names it, and before any kernel."""
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from factorbus.workers.app import work
 from factorbus.workers.config import BadConfig as BadWorkerConfig
 from factorbus.workers.config import WorkerConfig
 
-REPLICA = {"upstream": "tcp/127.0.0.1:9", "journal": "maps"}
+REPLICA = Config(listen=("tcp/127.0.0.1:0",), upstream="tcp/127.0.0.1:9", journal="maps")
 BAD = {
     "missing": (None, "No such file"),
     "a folder": ("", "Is a directory"),
@@ -43,7 +44,7 @@ def not_reached(*_: Any, **__: Any) -> Any:
 @pytest.mark.parametrize("setting", ["zenoh", "upstream_zenoh"])
 def test_a_service_does_not_begin_with_it(setting: str, case: str, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app, "ready_to_compute", not_reached)
-    config = Config(listen=("tcp/127.0.0.1:0",), **REPLICA, **{setting: str(file)})
+    config = replace(REPLICA, **{setting: str(file)})
     with pytest.raises(BadConfig, match=BAD[case][1]) as bad:
         app.serve(config, not_reached, threading.Event())
     assert str(file) in bad.value.message
@@ -68,7 +69,7 @@ def test_a_replica_does_not_begin_with_keys_that_others_can_replace(
     key.chmod(0o666)
     file = tmp_path / "zenoh.json5"
     file.write_text(f'{{transport: {{link: {{tls: {{connect_private_key: "{key}"}}}}}}}}')
-    config = Config(listen=("tcp/127.0.0.1:0",), warm=False, upstream_zenoh=str(file), **REPLICA)
+    config = replace(REPLICA, warm=False, upstream_zenoh=str(file))
     with pytest.raises(BadConfig, match=r"key\.pem") as bad:
         app.serve(config, not_reached, threading.Event())
     assert bad.value.code == "unsafe_folder"

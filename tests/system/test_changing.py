@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from processes import Process
 
 from factorbus.client import Changes, Draft, Map, Refused, aio, connect
+from factorbus.client.changes import FactorsOfAnother
 from factorbus.proto.messages import Accepted, Factors
 from factorbus.simulate import LoopClosures, manhattan
 
@@ -60,6 +62,26 @@ def test_an_insert_is_undone_and_everybody_sees_it(endpoint: str, square: Map) -
     for old, new in zip(before.variables, after.variables, strict=True):
         assert old.keys.tolist() == new.keys.tolist()
         np.testing.assert_allclose(new.values, old.values, rtol=0, atol=1e-9)
+
+
+def test_ids_of_one_map_are_not_taken_for_those_of_another(endpoint: str, square: Map) -> None:
+    drive(square, 0, 6)
+    loop = Draft().between_se2("x1", "x5", (4, 0, 0), sigmas=SIGMAS)
+    accepted, found = square.insert(loop), square.repair()
+    found = replace(found, factors=np.array([accepted.first_factor]))
+    with connect(endpoint, client="changer", timeout_s=60) as bus, bus.map(f"{square.name}-2") as other:
+        drive(other, 0, 9)
+        revision = other.stats()["revision"]
+        for changes in (Changes().undo(loop, accepted), Changes().fix("x2").repair(found)):
+            with pytest.raises(FactorsOfAnother, match=f"epoch {accepted.epoch}; map '{other.name}' has") as refused:
+                other.change(changes)
+            assert (refused.value.code, refused.value.detail["epoch"]) == ("wrong_epoch", other.epoch)
+        assert other.stats()["revision"] == revision
+        bus.fork(square.name, f"{square.name}-3")
+        with bus.map(f"{square.name}-3", create=False) as fork:
+            gone = fork.change(Changes().undo(loop, replace(accepted, epoch=fork.epoch)))
+            assert gone.report["removed_factors"] == 1
+    square.change(Changes().undo(loop, accepted))
 
 
 def test_refusals_are_whole_and_have_their_codes(square: Map) -> None:

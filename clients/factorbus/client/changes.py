@@ -20,7 +20,21 @@ from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.asking import Repaired
 from factorbus.proto.messages import Accepted, Batch, Change, Chi2, Variables
-from factorbus.proto.problems import BadLoss, BadShape
+from factorbus.proto.problems import BadLoss, BadShape, Problem
+
+
+class FactorsOfAnother(Problem):
+    """Ids that a map gave are those of other factors in another map, or in one that was made anew."""
+
+    code = "wrong_epoch"
+
+    def __init__(self, epoch: int, name: str, own: int) -> None:
+        super().__init__(
+            f"changes: they have ids of factors from an answer of epoch {epoch}; map {name!r} has epoch {own}, where "
+            "these are other factors. Give them to the map that answered, or look the factors up with `Map.graph`; in a "
+            "fork, where ids are the same, use `dataclasses.replace(answer, epoch=fork.epoch)`",
+            epoch=own,
+        )
 
 
 class Changes:
@@ -34,6 +48,7 @@ class Changes:
 
     def __init__(self) -> None:
         self._changes: list[Change] = []
+        self._epochs: list[int] = []  # of answers whose ids of factors are among them
 
     def remove_factors(self, factors: Iterable[int] | int) -> Changes:
         """These factors go."""
@@ -44,11 +59,15 @@ class Changes:
         return self._add(Change("remove_variables", keys=_keys(keys), alone=checked_flag("changes: alone", alone)))
 
     def undo(self, batch: Batch | Draft, accepted: Accepted) -> Changes:
-        """What an insert brought goes again; refused (in_use) where something that came later rests on it."""
+        """What an insert brought goes again; refused (in_use) where something that came later rests on it.
+
+        In the map that `accepted` is of: another one raises FactorsOfAnother when the changes are given to it.
+        """
         batch = batch_of("changes: undo", batch)
         accepted = of_type("changes: undo", accepted, Accepted, "the answer to the insert, an Accepted")
         brought = [group.keys for group in batch.variables]
         first = accepted.first_factor
+        self._epochs.append(accepted.epoch)
         if batch.factor_count:
             self._add(Change("remove_factors", np.arange(first, first + batch.factor_count)))
         if batch.variables:
@@ -125,8 +144,11 @@ class Changes:
         return self.place(found.variables, carry=True)
 
     def repair(self, repaired: Repaired, loss: tuple[str, float] | str | None = None) -> Changes:
-        """What is false goes, or gets a loss, ("dcs", 1.0) say; the map goes on from the repaired values."""
-        of_type("changes: repair", repaired, Repaired, "an answer of `Map.repair`")
+        """What is false goes, or gets a loss, ("dcs", 1.0) say; the map goes on from the repaired values.
+
+        In the map that `repaired` is of, as `undo`.
+        """
+        self._epochs.append(of_type("changes: repair", repaired, Repaired, "an answer of `Map.repair`").epoch)
         name_and_scale = None if loss is None else loss_of("repair", loss)
         if not repaired.factors.size:
             return self.place(repaired.variables)
@@ -139,6 +161,13 @@ class Changes:
     def listed(self) -> tuple[Change, ...]:
         """What has been put together so far."""
         return tuple(self._changes)
+
+    def listed_in(self, name: str, epoch: int) -> tuple[Change, ...]:
+        """The same, for the map of that epoch.  Raises FactorsOfAnother."""
+        for other in self._epochs:
+            if other != epoch:
+                raise FactorsOfAnother(other, name, epoch)
+        return self.listed()
 
     def _add(self, change: Change) -> Changes:
         self._changes.append(change)

@@ -181,13 +181,14 @@ class Map:
         Raises Unavailable if the window stays full for `timeout_s`, TooLarge, NotSupported, BadOption: nothing is sent.
         """
         batch, settle = batch_of("batch", batch), checked_flag("settle", settle)
-        listed = () if changes is None else of_type("changes", changes, Changes, "a Changes").listed()
+        changes = Changes() if changes is None else of_type("changes", changes, Changes, "a Changes")
         check_stamps(self._protocol, batch)
         check_trusted(self._protocol, batch)
         timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
                 self._wait_for_room(timeout_s)
+            listed = changes.listed_in(self.name, self.epoch)
             check_changes(self._protocol, listed)
             insert = Insert(self._window.next, batch, settle, self.epoch, convert_below, listed)
             pending_insert = self._pending_insert(insert, timeout_s)

@@ -155,6 +155,7 @@ def command(as_json: bool, **asked: Any) -> None:
                    batch_converged false: its search ended before it had converged, the true optimum may be lower
       error_m      of a .jrl with ground truth: how far the poses are from it, which is first moved as one rigid body
                    to where it fits the estimate best (rms, max, and of how many poses)
+      closure_states  of a map that tests them: how many closures are in each state at the end; else null
       adopted      null, or what the map left for a better optimum at the end (better_optimum)
     """
     request = ReplayRequest(**asked)
@@ -244,6 +245,7 @@ def _document(
         "solver_cpu_s": after["solver_cpu_s"] - before["solver_cpu_s"],
         "kernels_compiled_s": after["kernels_compiled_s"],
         "deltas": after["deltas"],
+        "closure_states": after["closure_states"],
         "use_values": request.use_values,
         "against_batch": [each.as_dict() for each in target.compared()],
     }

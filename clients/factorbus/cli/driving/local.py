@@ -82,7 +82,12 @@ class LocalMap:
 
     def summary(self) -> dict[str, Any]:
         """CPU seconds of this thread in the solver, seconds of compiling."""
-        return {"solver_cpu_s": self._cpu_s, "kernels_compiled_s": compile_seconds(), "deltas": None}
+        return {
+            "solver_cpu_s": self._cpu_s,
+            "kernels_compiled_s": compile_seconds(),
+            "deltas": None,
+            "closure_states": None,
+        }
 
     def _step(self, start: float, settle: bool) -> DriveStep:
         report = self._solver.step(settle=settle).as_dict()

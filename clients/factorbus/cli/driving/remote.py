@@ -99,6 +99,7 @@ class RemoteMap:
             "solver_cpu_s": stats["solver_cpu_s"],
             "kernels_compiled_s": stats["kernels_compiled_s"],
             "deltas": sum(revision <= self._waited for revision in self._received),
+            "closure_states": stats.get("closure_states"),
         }
 
     @property

@@ -24,6 +24,8 @@ def replay_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("estimates received", f"{result['deltas']}, at revision {result['revision']}"))
     initial = "" if result["chi2_initial"] is None else f", {result['chi2_initial']:.6g} by odometry"
     rows.append(("χ²", f"{result['chi2']:.8g}, {result['chi2_unsettled']:.8g} after the last step{initial}"))
+    if states := result["closure_states"]:
+        rows.append(("closures", ", ".join(f"{count} {state}" for state, count in states.items())))
     if error := result.get("error_m"):
         away = f"rms {error['rms']:.3g} m, max {error['max']:.3g} m of {counted(error['poses'], 'pose')}"
         rows.append(("from ground truth", f"{away}, aligned"))
