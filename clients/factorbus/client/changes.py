@@ -31,8 +31,8 @@ class FactorsOfAnother(Problem):
     def __init__(self, epoch: int, name: str, own: int) -> None:
         super().__init__(
             f"changes: they have ids of factors from an answer of epoch {epoch}; map {name!r} has epoch {own}, where "
-            "these are other factors. Give them to the map that answered, or look the factors up with `Map.graph`; in a "
-            "fork, where ids are the same, use `dataclasses.replace(answer, epoch=fork.epoch)`",
+            "these are other factors. Give them to the map that answered, or look the factors up with `Map.graph`; in "
+            "a fork, where ids are the same, use `dataclasses.replace(answer, epoch=fork.epoch)`",
             epoch=own,
         )
 
