@@ -1,5 +1,7 @@
 """What a map keeps, as text: every form of it comes to one, and nothing wrong passes."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -42,9 +44,20 @@ def test_a_mapping_is_as_good_as_text() -> None:
         "per_area=2:1.5", "per_area=nan", "per_area=inf", "per_area=2,window=-1", "per_area=2,window=0",
         "per_area=2,landmarks=2.5", "per_area=2,loss=-1", "per_area=2,per_area=3", "per_area=2,other=3",
         "per_area=2,window=99999999999999999999999", "all,per_area=2", "per_area=2;window=3",
+        "per_area=1_0", "per_area=\uff12", "per_area=2,window=\uff11\uff12", "per_area=2,loss=1_0",
     ],
 )  # fmt: skip
 def test_anything_else_is_refused_and_says_what_was_wanted(wrong: str) -> None:
     with pytest.raises(BadOption, match="keep") as refused:
         try_keep(wrong)
     assert refused.value.detail["wanted"]
+
+
+@pytest.mark.parametrize("wrong", [None, 5, 2.0, b"per_area=2", [2, 3], ("per_area", 2)])
+def test_what_is_neither_text_nor_a_mapping_is_refused_so_too(wrong: Any) -> None:
+    with pytest.raises(BadOption, match=rf"keep: is .*{type(wrong).__name__}"):
+        keep_text(wrong)
+
+
+def test_one_policy_has_one_text() -> None:
+    assert keep_text("per_area=2,loss=-0") == keep_text("per_area=2,loss=0.0") == keep_text({"per_area": 2, "loss": 0})

@@ -18,6 +18,7 @@ from zenoh.handlers import Callback
 from factorbus.client import Map, Refused, connect
 from factorbus.journal.store import open_store
 from factorbus.proto import codec, keys
+from factorbus.proto.keep import keep_text
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.own_clients import KEEPER
 from factorbus.proto.problems import BadOption
@@ -145,6 +146,26 @@ def test_its_size_follows_the_street_and_not_the_days(services: Callable[..., Se
     values, own = replayed(tmp_path / "j" / "street")
     assert values == rows(estimate.variables)
     assert own >= 4
+
+
+def test_a_replica_asks_its_upstream_for_the_same_policy(services: Callable[..., Services], tmp_path: Path) -> None:
+    base = services(tmp_path / "base")
+    link = Link(base.start())
+    robot = services(tmp_path / "robot", *replica_settings(link, 'keep="per_area=2.5,window=5"'))
+    with (
+        connect(link.endpoint, client="watcher", timeout_s=PATIENCE_S) as far,
+        connect(robot.start(), client="robot", timeout_s=PATIENCE_S) as near,
+        near.map(MAP) as driven_here,
+    ):
+        wanted = keep_text(KEEP)
+        base.eventually(lambda: {row.name: row.keep for row in far.maps()}, lambda seen: seen.get(MAP) == wanted)
+        far.create("all", keep="all")
+        with near.map("all") as alone:
+            robot.eventually(lambda: alone.stats().get("upstream", {}).get("code"), lambda seen: seen == "other_keep")
+        drive(driven_here, 0)
+        robot.eventually(lambda: len(poses_of(driven_here)), lambda seen: seen < LENGTH / 2)
+        assert not driven_here.stats()["kept"]["pending"], "upstream looks, not the replica"
+    link.relay.close()
 
 
 @pytest.mark.timeout(600)

@@ -9,6 +9,7 @@ loss        the most that may be lost for each pose that goes, nats
 """
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from factorbus.proto.problems import BadOption
 
 KEEP_OPTION, KEEP_ALL = "keep", "all"
 _WANTED = "all, or per_area=METRES[:POSES] and any of window=N, landmarks=N, loss=NATS, such as per_area=2,window=50"
+_NUMBER = re.compile(r"[0-9.eE+-]+")  # Python takes 1_0 and digits of other scripts, too
 _MOST = {"poses": 1000, "window": 10**9, "landmarks": 10**9}
 
 
@@ -58,6 +60,8 @@ def keep_text(given: str | Mapping[str, Any] | KeepSettings, where: str = KEEP_O
 
     Raises BadOption.
     """
+    if not isinstance(given, str | Mapping | KeepSettings):
+        raise BadOption(where, f"is {given!r:.64} ({type(given).__name__})", f"{_WANTED}; or a mapping of these")
     if isinstance(given, Mapping):
         area = given.get("per_area")
         if isinstance(area, list | tuple):
@@ -72,7 +76,7 @@ def keep_text(given: str | Mapping[str, Any] | KeepSettings, where: str = KEEP_O
 
 def _number(where: str, name: str, text: str, least: float, most: float) -> float:
     try:
-        value = float(text)
+        value = float(text) + 0.0 if _NUMBER.fullmatch(text) else math.nan  # without a sign, where it is 0
     except ValueError:
         value = math.nan
     if not least <= value <= most:
@@ -81,7 +85,7 @@ def _number(where: str, name: str, text: str, least: float, most: float) -> floa
 
 
 def _whole(where: str, name: str, text: str) -> int:
-    value = int(text) if text.isdecimal() and len(text) < 20 else 0
+    value = int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else 0
     if not 1 <= value <= _MOST[name]:
         raise BadOption(where, f"has {name}={text[:32]!r}", f"a whole number from 1 to {_MOST[name]}")
     return value

@@ -103,4 +103,5 @@ class IdleRemovals:
         if self.keep == KEEP_ALL:
             return {}
         told = {"removed_poses": self._poses, "loss": self._loss, "largest_loss": self._most}
-        return {"kept": told | {"left": self._planned.left, "pending": self._wanted, "failed": self._failed}}
+        pending = self._active and self._wanted
+        return {"kept": told | {"left": self._planned.left, "pending": pending, "failed": self._failed}}

@@ -289,7 +289,8 @@ class Replicas:
 
     def _join(self, followed: _Followed, effect: JoinUpstream) -> None:
         core = followed.host.core
-        payload = codec.encode_map({"map": core.name, "mode": core.mode, "closures": core.closures})
+        made_as = {"mode": core.mode, "closures": core.closures} | core.removals.row()
+        payload = codec.encode_map({"map": core.name} | made_as)
         self._query(followed, effect.number, keys.admin_key("create"), payload)
 
     def _ask(self, followed: _Followed, effect: AskUpstream) -> None:
