@@ -66,3 +66,12 @@ def test_fields_of_a_journal_are_rounded_and_empty_ones_left_away() -> None:
         "longest commit ms": "12,346",
         "seconds": "0.0123",
     }
+
+
+def test_top_counts_what_a_map_took_out_where_any_keeps_some_poses_alone() -> None:
+    names, _ = top._maps(SEEN)
+    assert "taken out" not in names
+    kept = {"removed_poses": 12345, "failed": False}
+    maps = [MAP, MAP | {"kept": kept}, MAP | {"kept": kept | {"failed": True}}]
+    names, rows = top._maps(SEEN | {"maps": maps})
+    assert [row[names.index("taken out")] for row in rows] == ["", "12,345", "12,345, failed"]

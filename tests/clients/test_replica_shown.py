@@ -39,3 +39,8 @@ def test_top_has_a_line_of_each_map_that_follows() -> None:
     names, rows = _upstreams({"maps": [{"name": "hall"}, {"name": "yard", "upstream": ROW}]})
     assert names == ("replica", "upstream", "link", "behind", "rebased")
     assert rows == [("yard", "tcp/base:7447", "connected for 65 s", "0", "0")]
+
+
+def test_top_says_why_a_map_does_not_follow() -> None:
+    _, ((*_, link, _, _),) = _upstreams({"maps": [{"name": "yard", "upstream": ROW | {"code": "other_keep"}}]})
+    assert link == "connected for 65 s, other_keep"

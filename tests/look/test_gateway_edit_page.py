@@ -11,7 +11,7 @@ from browser import needs_browser, page_of
 from gateways import Editor, arc, square
 from processes import Process
 
-from factorbus.client import Bus, Draft, connect
+from factorbus.client import Bus, Changes, Draft, connect
 
 pytest.importorskip("starlette")
 
@@ -323,3 +323,12 @@ def test_a_map_that_is_dropped_is_said_to_be_gone_and_one_that_comes_is_live_aga
             joined.insert(arc())
         page.page.locator("#maps").hover()
         page.page.locator("#maps option[value=later]").wait_for(state="attached")
+
+
+def test_what_is_taken_out_is_counted_in_the_line_of_the_state(bus: Bus, gateway: str) -> None:
+    with bus.map("thinned") as joined:
+        joined.insert(square())
+        with page_of(f"{gateway}/#thinned") as page:
+            page.locator("#state", has_text="17 variables").wait_for()
+            joined.change(Changes().remove_variables("x16"))
+            page.locator("#state", has_text="1 taken out").wait_for()

@@ -113,7 +113,7 @@ def test_the_plots_begin_with_the_steps_before_the_viewer_came(
     path, steps = tmp_path / "late.rrd", list(city_trees(poses=80, seed=2))
     with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("late") as joined:
         before = [joined.insert(step.batch) for step in steps[:60]]
-        history = joined.ask.history(None).result()
+        history = joined.ask.history().result()
         assert {step.revision for step in before} <= set(history.revisions.tolist())
         watcher = spawn("-m", "factorbus.cli", "watch", "late", "--connect", endpoint, "--save", str(path))
         watcher.ready()

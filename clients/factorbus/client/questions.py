@@ -60,7 +60,7 @@ class Questions:
         """What the service counts and times about the map."""
         return self._ask("stats", codec.encode_map({}), codec.decode_map, timeout_s)
 
-    def history(self, timeout_s: float | None) -> Future[StepHistory]:
+    def history(self, timeout_s: float | None = None) -> Future[StepHistory]:
         """χ², time and work of the steps since the service has opened the map, the more sparsely the longer ago."""
         return self._ask("history", codec.encode_map({}), decode_step_history, timeout_s)
 

@@ -35,6 +35,8 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
       step ms    solver's time of a step, mean since the look before
       χ²         converging: left alone, the map goes on by itself to its optimum; gave up: it does not
       budget     where steps have one: what the last one took of it, and relinearizations left for later ones
+      suspects   where loop closures are tested: how many are not believed, of all
+      taken out  where a map keeps some poses (factorbus serve --keep): how many went since the service has it open
       waiting    inserts that are accepted by no step yet, and those parked behind a gap
       interest   a part of a map that clients follow, what its channel carries, and variables that wait for that
       client     those that are there; gone: those that have left, whose inserts are in the map
@@ -99,7 +101,7 @@ def view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType":
 # Columns of each table, the first of which stays; where not all have room the last of these goes first.
 _MATTER = (
     "variables", "revision", "χ²", "step ms", "waiting", "steps/s", "factors", "inserts", "map", "inserts/s", "refused",
-    "budget", "suspects",
+    "budget", "suspects", "taken out",
     "mode", "slots", "in flight", "latency ms", "bytes/s", "at most", "upstream", "rebased", "link", "behind",
 )  # fmt: skip
 _ANY_WIDTH = 10_000
@@ -110,7 +112,7 @@ _Table = tuple[tuple[str, ...], list[tuple[str, ...]]]  # names of columns, rows
 def _maps(seen: dict[str, Any]) -> _Table:
     names = (
         "map", "mode", "variables", "factors", "revision", "steps/s", "inserts/s", "step ms", "χ²", "waiting",
-        "refused", "budget", "suspects",
+        "refused", "budget", "suspects", "taken out",
     )  # fmt: skip
     rows = [
         (
@@ -127,6 +129,7 @@ def _maps(seen: dict[str, Any]) -> _Table:
             f"{row['refused']}" + (f", {row['busy']} busy" if row["busy"] else ""),
             _budget(row),
             _suspects(row),
+            _taken_out(row),
         )
         for row in seen["maps"]
     ]
@@ -135,6 +138,8 @@ def _maps(seen: dict[str, Any]) -> _Table:
         shown.remove("suspects")  # no map tests closures
     if not any("budget" in row for row in seen["maps"]):
         shown.remove("budget")
+    if not any("kept" in row for row in seen["maps"]):
+        shown.remove("taken out")  # all maps keep all poses
     places = [names.index(name) for name in shown]
     return tuple(shown), [tuple(row[place] for place in places) for row in rows]
 
@@ -149,6 +154,12 @@ def _budget(row: dict[str, Any]) -> str:
 def _suspects(row: dict[str, Any]) -> str:
     states = row.get("closure_states")
     return "" if states is None else f"{states['suspect']} of {sum(states.values())}"
+
+
+def _taken_out(row: dict[str, Any]) -> str:
+    if (kept := row.get("kept")) is None:
+        return ""
+    return f"{kept['removed_poses']:,}" + (", failed" if kept["failed"] else "")
 
 
 def _convergence(row: dict[str, Any]) -> str:
@@ -199,7 +210,8 @@ def _upstreams(seen: dict[str, Any]) -> _Table:
         (
             name,
             row["endpoint"],
-            f"{'connected' if row['connected'] else 'out of reach'} for {row['since_s']:,.0f} s",
+            f"{'connected' if row['connected'] else 'out of reach'} for {row['since_s']:,.0f} s"
+            + (f", {row['code']}" if row["code"] else ""),
             f"{row['behind']:,}",
             f"{row['rebased']:,}",
         )

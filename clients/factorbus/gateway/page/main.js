@@ -47,11 +47,13 @@ app.redraw = () => {
 function changed() {
   const { map } = app;
   const { chi2, step_ms: ms, strategy, converging, budget_ms: budget, complete, deferred_relinearizations: deferred } = map.report;
+  const { removed_variables: removed } = map.report; // by a change, or by the map's own policy
   const words = [`revision ${map.revision}`, `${map.variables.size} variables`];
   if (chi2 !== undefined) words.push(`χ² ${chi2.toPrecision(6)}`);
   const ofBudget = budget === undefined ? "" : `of ${budget} `;
   if (ms !== undefined) words.push(`step ${ms.toFixed(2)} ${ofBudget}ms ${strategy ?? ""}`);
   if (complete === false) words.push(`${deferred} relinearizations and more are left for later steps`);
+  if (removed) words.push(`${removed} taken out`);
   if (converging) words.push("converging");
   of("state").textContent = map.state === "live" ? words.join(" · ") : map.state;
   refresh();
