@@ -1,5 +1,6 @@
 """What a map keeps: which poses go, what is left of what they said, against dense algebra, and that nothing moves."""
 
+import time
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from factorbus.solver.graph.quadratic import quadratic
 from factorbus.solver.lifelong.eliminating import try_eliminate
 from factorbus.solver.lifelong.plan import KeepPlan, plan_removals
 from factorbus.solver.lifelong.policy import KeepPolicy
-from factorbus.solver.lifelong.redundant import find_redundant
+from factorbus.solver.lifelong.redundant import _surplus, find_redundant
 from factorbus.solver.lifelong.relative_terms import RelativeTerm, factor_of_term
 
 NOBODY = np.empty(0, np.int64)
@@ -88,6 +89,14 @@ def test_a_letter_that_is_left_behind_keeps_its_last_pose() -> None:
     assert {9, 10} & set(redundant)
     assert all(key >> 56 == 0 or key & 0xFFFF < 7 for key in redundant)
     assert {9, 10}.isdisjoint(found(both, KeepPolicy(2.5, window=13)))
+
+
+def test_an_area_as_large_as_the_map_is_looked_at_as_fast_as_a_small_one() -> None:
+    """An insert of a client may have to wait for a look.  Half of the poses stay anyway, as those with GNSS do."""
+    places = np.random.default_rng(3).uniform(0.0, 100.0, (6000, 3)) * (1, 1, 0)
+    may_go, begun = np.arange(6000) % 2 == 0, time.process_time()
+    assert _surplus(places, may_go, KeepPolicy(1000.0)).size == 3000
+    assert time.process_time() - begun < 1.0, "all of them count each other where nothing ends that"
 
 
 def test_a_landmark_that_few_see_keeps_its_poses() -> None:

@@ -5,7 +5,7 @@ of a landmark that is estimated, or sees a landmark that too few see.  Of the ot
 them, and find them again.
 """
 
-from itertools import product
+from itertools import islice, product
 from typing import NamedTuple
 
 import numpy as np
@@ -79,8 +79,8 @@ def _surplus(places: F64, may_go: np.ndarray, policy: KeepPolicy) -> I64:
         cell = int(x // policy.spacing_m), int(y // policy.spacing_m), int(z // policy.spacing_m)
         if may_go[n]:
             close = [kept[at_it] for a, b, c in around if (at_it := (cell[0] + a, cell[1] + b, cell[2] + c)) in kept]
-            near = sum((p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2 < reach for some in close for p, q, r in some)
-            if near >= policy.poses:
+            near = (1 for some in close for p, q, r in some if (p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2 < reach)
+            if sum(islice(near, policy.poses)) == policy.poses:  # no more are counted: a large area may have all poses
                 found.append(n)
                 continue
         kept.setdefault(cell, []).append((x, y, z))
