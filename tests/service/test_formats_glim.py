@@ -1,5 +1,7 @@
 """Maps that GLIM has saved: submaps are poses, factors are those of its graph, and what is not there is said."""
 
+import struct
+import time
 from pathlib import Path
 
 import gtsam
@@ -228,6 +230,8 @@ BAD = {
         ("vgicp 0 1", "vgicp 1 1", "matching_cost of submap 1 with itself; wanted two"),
         ("vgicp 0 1", "vgicp 0 -1", "with -1; wanted a whole number"),
         ("vgicp 0 1", "", "matching_cost with "),
+        ("num_submaps: 3", "num_submaps: 3\npruned_range 0 2", "every one of 3 submaps pruned; wanted one or more"),
+        ("num_submaps: 3", "pruned_range 0 0\nnum_submaps: 3", "graph.txt:5: matching_cost of submap 0; wanted one of"),
     ],
     "000001/data.txt": [
         ("T_world_origin: \n1 0", "T_world_origin: \n2 0", r"data.txt:2: T_world_origin that is no rotation"),
@@ -250,6 +254,47 @@ def test_what_is_wrong_is_named(tmp_path: Path, name: str, good: str, bad: str, 
     assert good in squeezed
     path.write_text(squeezed.replace(good, bad, 1) + "\n")
     with pytest.raises(FormatError, match=said):
+        read(folder)
+
+
+def test_many_pruned_ranges_take_no_time(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "map", DRIVE[:1], more="pruned_range 0 999998\n" * 400)
+    text = (folder / "graph.txt").read_text()
+    (folder / "graph.txt").write_text(text.replace("num_submaps: 1", "num_submaps: 1000000"))
+    begun = time.process_time()
+    with pytest.raises(FormatError, match=r"999999/data\.txt: it cannot be read"):
+        read(folder)
+    assert time.process_time() - begun < 3.0
+
+
+def test_what_a_method_is_called_is_shown_only_where_it_is_a_name(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "map", DRIVE[:3], [("\x1b[31m", 0, 1), ("m" * 5000, 0, 2)], [damping()])
+    (note,) = [note for note in read(folder).notes if "matching_cost" in note]
+    assert "2 matching_costs (unnamed)" in note
+
+
+def test_a_loss_whose_scale_is_no_number_is_left_out(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "map", DRIVE[:3], factors=pose_graph(DRIVE[:3], [(0, 2)]))
+    content = (folder / "graph.bin").read_bytes()
+    at, scale = content.index(b"Huber"), struct.pack("<d", 1.0)
+    place = content.index(scale, at)
+    for name, number in ((b"Huber", -1.0), (b"Huber", float("nan"))):
+        bad = content[:place] + struct.pack("<d", number) + content[place + 8 :]
+        (folder / "graph.bin").write_bytes(bad)
+        assert any(f"loss {name.decode()} of {number:g}" in note for note in read(folder).notes)
+    dcs = content[: at - len(b"gtsam::noiseModel::mEstimator::") - 8]
+    whole = b"gtsam::noiseModel::mEstimator::DCS"
+    dcs += (
+        struct.pack("<Q", len(whole)) + whole + content[at + 5 : place] + struct.pack("<d", -1.0) + content[place + 8 :]
+    )
+    (folder / "graph.bin").write_bytes(dcs)
+    assert any("loss DCS of -1" in note for note in read(folder).notes)
+
+
+def test_a_graph_txt_that_is_empty_is_said_to_be(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "map", DRIVE[:3], factors=pose_graph(DRIVE[:3]))
+    (folder / "graph.txt").write_text("")
+    with pytest.raises(FormatError, match=r"graph.txt: no submap; wanted a line"):
         read(folder)
 
 

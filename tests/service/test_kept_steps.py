@@ -1,8 +1,10 @@
 """The steps that a map has made are kept for who comes late: the newest all, the older ones the more sparsely."""
 
 import numpy as np
+import pytest
 
-from factorbus.proto.step_history import decode_step_history
+from factorbus.proto.problems import BadMessage
+from factorbus.proto.step_history import StepHistory, decode_step_history, encode_step_history
 from factorbus.service.core.events import Stepped
 from factorbus.service.core.kept_steps import KeptSteps
 
@@ -46,3 +48,11 @@ def test_steps_that_do_not_count_any_more_are_replaced() -> None:
     for revision in (1, 2, 3, 4, 3, 4):
         steps.add(step(revision))
     np.testing.assert_array_equal(steps.history(7, 4).revisions, [1, 2, 3, 4])
+
+
+@pytest.mark.parametrize("revisions", [[3, 2], [2, 2], [2**63 - 1, -(2**63)]])
+def test_revisions_that_cannot_be_are_refused(revisions: list[int]) -> None:
+    steps = np.zeros(2)
+    told = encode_step_history(StepHistory(7, 5, np.array(revisions), steps, steps, steps, steps))
+    with pytest.raises(BadMessage, match="revisions: some out of order; wanted ascending ones"):
+        decode_step_history(told)

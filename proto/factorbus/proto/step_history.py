@@ -53,10 +53,13 @@ def decode_step_history(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> S
     size = len(fields.binary("", content, "revisions"))
     if size % 8:
         raise BadMessage("revisions", counted(size, "byte"), "a multiple of 8")
+    revisions = _whole_numbers(content, "revisions", size)
+    if (revisions[1:] <= revisions[:-1]).any():
+        raise BadMessage("revisions", "some out of order", "ascending ones")
     return StepHistory(
         epoch=fields.integer("", content, "epoch"),
         revision=fields.integer("", content, "revision"),
-        revisions=_whole_numbers(content, "revisions", size),
+        revisions=revisions,
         chi2=fields.rows(lambda: "", content, "chi2", size // 8, 1).reshape(-1),
         step_ms=fields.rows(lambda: "", content, "step_ms", size // 8, 1).reshape(-1),
         eliminated=_whole_numbers(content, "eliminated", size),

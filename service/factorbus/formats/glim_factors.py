@@ -107,11 +107,16 @@ def _unread(factor: ArchivedFactor) -> str:
     noise, dim = factor.noise, FACTOR_KINDS[_KINDS[factor.name]].dim
     if not noise.root.size:
         return "without a covariance"
-    if noise.loss and not (noise.loss in _LOSSES and _LEAST <= noise.parameter ** _LOSSES[noise.loss][1] <= _MOST):
+    if noise.loss and not _is_scale(noise.loss, noise.parameter):
         return f"with the loss {noise.loss} of {noise.parameter:g}"
     if noise.root.shape != (dim, dim) or not positive_definite(packed_upper(_information(factor)[None]), dim)[0]:
         return "with an information that is not positive definite"
     return "" if _is_rigid(factor.measured) else "with numbers that are no position or rigid transform"
+
+
+def _is_scale(loss: str, parameter: float) -> bool:
+    """Whether a loss here has such a scale; below 0 the root of one is no number."""
+    return loss in _LOSSES and parameter > 0.0 and _LEAST <= parameter ** _LOSSES[loss][1] <= _MOST
 
 
 def _is_rigid(measured: F64) -> bool:

@@ -32,6 +32,7 @@ from factorbus.wording import counted
 
 GRAPH_TEXT = "graph.txt"
 _FRAME = re.compile(r"frame_\d+")
+_METHOD = re.compile(r"[\w.+-]{1,40}", re.ASCII)  # it is shown
 _COUNT = re.compile(r"\d{1,18}")
 _MOST_SUBMAPS = 1_000_000  # their folders have six digits
 _SKEW = 0.01  # how far the six digits of a rotation matrix may be from one
@@ -87,24 +88,28 @@ def is_glim_text(content: bytes) -> bool:
 
 def read_index(path: Path) -> GlimIndex:
     """graph.txt.  Raises FormatError."""
-    file, count, pruned, costs = str(path), None, set(), []
+    file, count, ranges, costs = str(path), None, [], []
     for line, words in _lines(path):
         if words[0] == "num_submaps:":
             count = _whole(file, line, words, 1)
         elif words[0] == "pruned_range":
-            first, last = _whole(file, line, words, 1), _whole(file, line, words, 2)
-            pruned.update(range(first, min(last, count or 0, _MOST_SUBMAPS) + 1))
+            ranges.append((_whole(file, line, words, 1), _whole(file, line, words, 2)))
         elif words[0] == "matching_cost":
             method = words[1] if len(words) > 3 else ""  # GLIM writes none for a method that it does not know
             ends = [_whole(file, line, words, place) for place in (len(words) - 2, len(words) - 1)]
-            costs.append(MatchingCost(line, method, *ends))
+            costs.append(MatchingCost(line, method if _METHOD.fullmatch(method) else "", *ends))
     if not count or count > _MOST_SUBMAPS:
         seen = f"{count:,} submaps" if count else "no submap"
         raise FormatError(file, None, seen, f'a line "num_submaps: N" with 1 to {_MOST_SUBMAPS:,}')
-    there = tuple(number for number in range(count) if number not in pruned)
+    is_there = np.ones(count, bool)
+    for first, last in ranges:
+        is_there[first : last + 1] = False
+    there = tuple(np.flatnonzero(is_there).tolist())
+    if not there:
+        raise FormatError(file, None, f"every one of {counted(count, 'submap')} pruned", "one or more that is not")
     for cost in costs:
         for end in (cost.first, cost.second):
-            if end in pruned or end >= count:
+            if end >= count or not is_there[end]:
                 raise FormatError(
                     file, cost.line, f"matching_cost of submap {end}", f"one of the {len(there)} there are"
                 )

@@ -34,11 +34,14 @@ from factorbus.proto.symbols import symbol
 from factorbus.wording import counted
 
 GLIM = "glim"
+GRAPH_BINARY = "graph.bin"
 _UNKNOWN_COVARIANCE = 1e6  # GLIM's precision of a relative pose of which it has no covariance, per m² and rad²
 
 
 def is_glim(path: Path) -> bool:
-    """Whether it is the folder of such a map, or the graph.txt in it."""
+    """Whether it is the folder of such a map, or the graph.txt in it; by their names alone, to say what it lacks."""
+    if (path / GRAPH_TEXT).is_file() and (path / GRAPH_BINARY).is_file():
+        return True
     try:
         with (path / GRAPH_TEXT if path.is_dir() else path).open("rb") as text:
             return is_glim_text(text.read(64))
@@ -51,7 +54,7 @@ def read_glim(path: Path, left: LeftOut) -> tuple[Batch, tuple[I64, ...]]:
     folder = path if path.is_dir() else path.parent
     index = read_index(folder / GRAPH_TEXT)
     submaps = {number: read_submap(folder, number) for number in index.submaps}
-    factors = archived_factors(folder / "graph.bin", {symbol("x", number) for number in submaps}, left)
+    factors = archived_factors(folder / GRAPH_BINARY, {symbol("x", number) for number in submaps}, left)
     edges = factor_edges(factors)
     edges += _matched(index, submaps, len(factors), left)
     edges += _followed(submaps, edges, left)
