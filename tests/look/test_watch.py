@@ -22,8 +22,11 @@ from factorbus.proto.ports import PortTaken
 from factorbus.simulate import city_trees, manhattan
 from factorbus.viz import style
 from factorbus.viz.geometry import feature_rays
+from factorbus.viz.map_follower import Look, MapFollower
 
 pytest.importorskip("rerun")
+
+from factorbus.viz import live
 
 
 def rows(path: Path) -> dict[str, dict[int, dict[str, Any]]]:
@@ -105,6 +108,35 @@ def test_the_recording_has_every_step_and_the_map_at_the_end(
     places = np.concatenate([last.columns["se2"][1][:, :2], last.columns["point2"][1]])
     assert np.linalg.norm(middles[:, None] - places, axis=2).min(axis=1).max() < 1e-3, "around what they are of"
     assert done[-1].report["because"] in found["/log"][done[-1].revision]["TextLog:text"][0]
+
+
+def test_a_last_look_has_the_values_that_go_with_its_factors(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The answer with the factors comes before the deltas of the steps before it, on a machine that is busy."""
+    steps = list(city_trees(poses=20, seed=2))
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("overtaken") as joined:
+        done = [joined.insert(step.batch) for step in steps]
+        waited, wait_for = list[int](), joined.estimate.wait_for
+
+        def spy(revision: int, timeout_s: float) -> None:
+            waited.append(revision)
+            wait_for(revision, timeout_s)
+
+        monkeypatch.setattr(joined.estimate, "wait_for", spy)
+        with MapFollower(joined) as follower:
+            look = follower.last_look(60)
+    assert waited == [look.factors_revision]
+    assert look.revision >= look.factors_revision >= done[-1].revision
+
+
+def test_the_last_look_is_drawn_however_large_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "_POSITIONS_PER_S", 1e-6)
+    view = live.LiveView("large")
+    view.save(tmp_path / "large.rrd")
+    for revision, last in ((1, False), (2, False), (3, True)):
+        poses = Variables("se2", np.arange(5), np.full((5, 3), float(revision)))
+        view.show(Look(1, revision, (poses,), (), (), revision, False), last)
+    view.close()
+    assert list(rows(tmp_path / "large.rrd")["/map/trajectory/poses"]) == [1, 3]
 
 
 def test_the_plots_begin_with_the_steps_before_the_viewer_came(

@@ -67,14 +67,14 @@ class LiveView:
         self._to.connect_grpc(viewer.data, default_blueprint=_blueprint(self._map))
         self._name_plots()
 
-    def show(self, look: Look) -> None:
-        """Log every step, and the map as it is now, unless it is large and was drawn just before."""
+    def show(self, look: Look, last: bool = False) -> None:
+        """Log every step, and the map as it is now, unless it is large, was drawn just before, and this is not last."""
         now = time.time()
         for delta in look.deltas:
             self._log_step(delta, now)
         track = track_of(look.variables)
         size = sum(len(group.keys) for group in look.variables)
-        if now - self._drawn_at >= size / _POSITIONS_PER_S:
+        if last or now - self._drawn_at >= size / _POSITIONS_PER_S:
             self._drawn_at = now
             self._at(look.revision, now)
             self._log_map(look, track)

@@ -14,7 +14,7 @@ from factorbus.client import Map, Snapshot
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Delta, Factors, MapGraph, Variables
-from factorbus.proto.problems import Problem
+from factorbus.proto.problems import Problem, Unavailable
 from factorbus.viz.certainty import MapCertainty
 from factorbus.viz.ellipses import Spread
 from factorbus.viz.rate_limit import RateLimited
@@ -90,9 +90,15 @@ class MapFollower:
         )
 
     def last_look(self, timeout_s: float) -> Look:
-        """A look with the factors of this revision or a later one, waiting for them.  Raises Refused, Unavailable."""
+        """A look with the factors of this revision or a later one, waiting for them, and the values that go with them.
+
+        Raises Refused, Unavailable.
+        """
         if self._with_factors:
-            self._graph.put(self._map.graph(timeout_s))
+            graph = self._map.graph(timeout_s)
+            self._graph.put(graph)
+            with suppress(Unavailable):  # answers pass deltas by; a map that has begun anew never comes to it
+                self._mirror.wait_for(graph.revision, timeout_s)
         if self._certainty:
             with suppress(Problem):  # a map that cannot say how certain it is can be looked at all the same
                 self._certainty.wait(_groups(self._mirror.snapshot()), timeout_s)

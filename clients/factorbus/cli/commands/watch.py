@@ -123,7 +123,7 @@ def command(
                 while not stop.wait(1 / rate) and (until is None or joined.estimate.revision < until):
                     if follower.wait(0):
                         view.show(follower.look())
-                view.show(follower.last_look(joined.timeout_s))
+                view.show(follower.last_look(joined.timeout_s), last=True)
         finally:
             view.close()
     unconverged = ", which had not converged" if joined.estimate.converged is False else ""
