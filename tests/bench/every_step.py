@@ -42,7 +42,7 @@ from bench.every.drives import KINDS, WORLDS, World, chosen, is_here
 from bench.every.follow import follow
 from bench.every.rows import far_steps, row_of, together
 from bench.every.verdicts import judge
-from bench.replays.command import natural, positive
+from bench.replays.command import folder_named, natural, positive
 from bench.replays.targets import missed
 
 from factorbus.solver import Options, SolverError, warm
@@ -175,7 +175,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help="of our solver")
     parser.add_argument("--no-isam2", action="store_true", help="ours only: a quarter of the time")
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="the document to FILE, or to -")
-    parser.add_argument("--out", type=Path, default=Path("out/bench/every-step"), help="where results are kept")
+    parser.add_argument("--out", type=folder_named, default=Path("out/bench/every-step"), help="where results are kept")
     return parser.parse_args()
 
 

@@ -47,7 +47,7 @@ from bench.replays import (
     world_targets,
 )
 from bench.replays.bars import Begin, Tell, bars
-from bench.replays.command import add_options, hand_out, positive
+from bench.replays.command import add_options, file_named, hand_out, positive
 from bench.replays.contestants import ENTRIES, ISAM2_NAMES, OURS, PEER, SKIPPING, STAND_INS, Entry
 from bench.replays.problems import ALL, Problem
 from bench.replays.samples import Sampling
@@ -117,7 +117,7 @@ def main() -> None:
     if not options.no_figures:
         document["figures"] = [str(path) for path in draw(options.out, found, document, plan)]
     if options.page is not None:
-        options.page.write_text(results_page.page(document, sys.argv[1:]))
+        Path(options.page).write_text(results_page.page(document, sys.argv[1:]))
     hand_out("peers", document, peer_table.report(document, verdicts), options)
     if targets.missed(verdicts):
         sys.exit(1)
@@ -303,7 +303,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_options(parser, "peers", repetitions=None)
     parser.add_argument("--chi2-every", type=positive, default=1, metavar="N", help="look at χ² at each Nth step (1)")
-    parser.add_argument("--page", type=Path, metavar="FILE", help="the page of results of the docs, to FILE")
+    parser.add_argument("--page", type=file_named, metavar="FILE", help="the page of results of the docs, to FILE")
     parser.add_argument("--seed", type=positive, default=secrets.randbelow(1 << 30) + 2, help="of worlds (drawn anew)")
     parser.add_argument("--judge", choices=OUR_MODES, default="auto", help="the mode that the targets are for")
     return parser.parse_args()

@@ -340,6 +340,7 @@ def test_the_command_fails_a_sloppy_solver_and_keeps_the_steps(
         (("--option", "bent=x"), "bent=x"),
         (("--option", "small_loop=900"), "small_loop_threshold"),
         (("--seed", "0"), "wanted 1 or more"),
+        (("--out", "/dev/null/out"), "wanted a folder"),
         (("--check", "-1"), "wanted 0 or more"),
         (("--poses", "-1"), "wanted 0 or more"),
     ],

@@ -348,3 +348,17 @@ def test_an_unknown_name_is_refused_with_those_there_are() -> None:
     )
     assert ran.returncode == 1
     assert "--only intle: none of the parts (replays, worlds, bus, growth, cores, full-pass, overhead)" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    "words", [("--page", "nowhere/page.md"), ("--page", "."), ("--json", "nowhere/peers.json"), ("--out", "plain/out")]
+)
+def test_a_path_that_cannot_be_written_is_told_before_anything_is_measured(
+    words: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("plain").write_text("")
+    monkeypatch.setattr(sys, "argv", ["peers", "--quick", *words])
+    with pytest.raises(SystemExit):
+        peers._options()
+    assert f"argument {words[0]}: '{words[1]}'; wanted a" in capsys.readouterr().err
