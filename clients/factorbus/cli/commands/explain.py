@@ -14,8 +14,8 @@ _PAGES = Path(__file__).parents[1] / "codes.md"
 # Exceptions whose code is not their name in another spelling.
 _CODES = {
     "apart": "not_positive_definite", "bad_configuration_file": "bad_file", "broken": "internal",
-    "closed_here": "unavailable", "interest_ended": "busy", "no_mirror": "unavailable",
-    "not_finite_numbers": "not_finite",
+    "closed_here": "unavailable", "factors_of_another": "wrong_epoch", "interest_ended": "busy",
+    "no_mirror": "unavailable", "not_finite_numbers": "not_finite",
     "not_held": "unknown_variable", "not_recorded": "no_journal", "not_reached": "unavailable",
     "dataset_problem": "problem", "format_error": "bad_file",
     "bad_recording": "bad_file",
