@@ -105,7 +105,8 @@ def test_an_edit_is_seen_by_the_kernels_that_have_it(
     old: str, new: str, anew: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if _jit.STOCK and "far" in anew:
-        anew = {"far", "goes_far"}  # nothing is called by its address
+        # Nothing is called by its address, and nothing that is declared of it matters to its callers.
+        anew = {"far"} if "types." in old else {"far", "goes_far"}
     before = stamps(SOURCE, monkeypatch)
     assert SOURCE.count(old) == 1
     after = stamps(SOURCE.replace(old, new), monkeypatch)
