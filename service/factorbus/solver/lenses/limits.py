@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.lenses import layout as at
 
 # No lens sees that far from its axis: a limit where the model has none.
@@ -35,6 +35,6 @@ def _first_turn(slope: Sequence[float]) -> float:
     return min(1.0 / math.sqrt(inverse.max()), UNLIMITED) if inverse.size else UNLIMITED
 
 
-def _positive(roots: Any) -> F64:
+def _positive(roots: Any) -> NDArray[np.float64]:
     """Those of `roots` that are real and above 0."""
     return roots.real[(abs(roots.imag) <= 1e-9 * abs(roots)) & (roots.real > 0.0)]
