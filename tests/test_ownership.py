@@ -122,6 +122,20 @@ def test_a_folder_that_can_be_replaced_is_not_safe(folder: Path, monkeypatch: py
         check_folder("the cache", inner)
 
 
+def test_a_folder_above_that_another_group_can_write_to_is_not_safe(folder: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root gives a folder to a group that it is not in")
+    inner = folder / "own"
+    inner.mkdir(mode=0o700)
+    folder.chmod(0o775)
+    assert why_unsafe(inner) == ("", "")  # of a group of ours
+    os.chown(folder, 0, ANOTHER)
+    with pytest.raises(UnsafeFolder, match=f"which group {ANOTHER} can write to"):
+        check_folder("the cache", inner)
+    folder.chmod(0o1775)
+    assert why_unsafe(inner) == ("", "")
+
+
 def test_a_mount_point_may_be_open(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inner = folder / "own"
     inner.mkdir(mode=0o700)

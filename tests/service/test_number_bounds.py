@@ -198,3 +198,44 @@ def test_run_again_from_a_journal_it_comes_to_the_same_bits(mode: str) -> None:
         assert (tried.map_solver.revision, tried.map_solver.size) == (again.map_solver.revision, again.map_solver.size)
         assert tried.estimate() == again.estimate()
     assert tried.map_solver.size == (1, 4)
+
+
+def identity(size: int) -> np.ndarray:
+    """An information matrix as it is sent, of one factor."""
+    return np.eye(size)[np.triu_indices(size)][None]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("metres", [500.0, -500.0])
+def test_a_step_that_leaves_a_scale_of_nothing_is_refused(mode: str, metres: float) -> None:
+    """A prior whose error along x goes with that of ln s, and a position that is far off along x: s = exp(∓450)."""
+    tried, s0 = Map(mode), symbol("s", 0)
+    origin = np.array([[0, 0, 0, 0, 0, 0, 1, 1]], float)
+    similar = Variables("sim3", np.array([s0]), origin)
+    joined = np.eye(7)
+    joined[0, 6] = joined[6, 0] = 0.9
+    prior = Factors("prior_sim3", np.array([[s0]]), origin, joined[np.triu_indices(7)][None])
+    assert tried.insert(Batch((similar,), (prior,))) == "accepted"
+    before = tried.estimate()
+    there = Factors("position_sim3", np.array([[s0]]), np.array([[metres, 0, 0]]), 1e6 * identity(3))
+    assert tried.insert(Batch((), (there,))) == "diverged"
+    assert tried.estimate() == before
+    assert tried.insert(Batch((), (prior,))) == "accepted"
+
+
+@pytest.mark.parametrize("model", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("least", [5e-324, -5e-324, 1e-300, -1e-160])
+def test_a_lens_with_a_distortion_of_next_to_nothing_is_one_without(model: float, least: float) -> None:
+    def added(last: float) -> tuple[str, float]:
+        """Code of the answer, and χ²."""
+        tried, x0 = Map("bayes-tree"), symbol("x", 0)
+        pose = Variables("se3", np.array([x0]), np.array([[0, 0, 0, 0, 0, 0, 1]], float), fixed=True)
+        place = np.array([[0.1, 0.2, 2.0]])
+        point = Variables("point3", np.array([POINT]), place)
+        more = [0.01, 0.01, -0.1, last, 0.0] if model == 0.0 else [-0.1, last if model == 2.0 else 0.0, 0, 0, last]
+        lens = [model, 500.0, 500.0, 320.0, 240.0, 0.0, *more]
+        seen = Factors("point_seen", np.array([[x0, POINT]]), np.array([[345.0, 290.0, *lens]]), identity(2))
+        prior = Factors("prior_point3", np.array([[POINT]]), place, identity(3))
+        return tried.insert(Batch((pose, point), (seen, prior))), tried.map_solver.chi2()
+
+    assert added(least) == added(0.0)

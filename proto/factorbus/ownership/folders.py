@@ -6,7 +6,8 @@ A folder is safe if
 - nobody else can write to it.  One exception: a folder of root's that is writable by a group of this process, because
   that is how a volume is given to a container (fsGroup in Kubernetes);
 - no folder above it lets others put another one in its place: each belongs to this user or root, and is not writable
-  by others, unless it is sticky (as /tmp is) or a mount point (a volume of a container).
+  by others, nor by a group that is neither root's nor of this process, unless it is sticky (as /tmp is) or a mount
+  point (a volume of a container).
 
 On a file system that is mounted read-only nobody can write, so everything there is safe: keys and settings come to a
 container so.
@@ -103,9 +104,14 @@ def _why_unsafe_above(path: Path, above: Path, status: os.stat_result) -> tuple[
     """Whether others can put another folder in the place of `path`, or of one above it, by writing to `above`."""
     if status.st_uid not in (os.geteuid(), _ROOT) and not _is_unmapped(status.st_uid):
         return f"it is in {above}, which belongs to user {status.st_uid}", "name a folder elsewhere"
-    writable = status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX
-    if writable and not os.path.ismount(above):
+    foreign = status.st_mode & stat.S_IWGRP and status.st_gid not in {_ROOT, *_groups()}
+    if status.st_mode & stat.S_ISVTX or os.path.ismount(above):
+        return "", ""
+    if status.st_mode & stat.S_IWOTH:
         return f"it is in {above}, which everybody can write to", f"chmod o-w {above}, or name a folder elsewhere"
+    if foreign:
+        who = f"it is in {above}, which group {status.st_gid} can write to"
+        return who, f"chmod g-w {above}, or name a folder elsewhere"
     return "", ""
 
 

@@ -13,11 +13,12 @@ import math
 import numpy as np
 
 from factorbus.solver import errors
+from factorbus.solver.graph.escaped import find_beyond
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.bounds import MOST_NUMBER, are_usual, find_escaped
+from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, are_usual
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
 
@@ -30,12 +31,15 @@ def check_step(solver: Solver, report: StepReport) -> None:
 
 def find_diverged(changed: I64, graph: FactorGraph, report: StepReport) -> errors.Diverged | None:
     """What the last step, which `changed` these variables, left out of bounds: one of them, or χ²."""
-    v = int(find_escaped(changed, graph.array_table))
+    v = find_beyond(changed, graph)
     if v >= 0:
         kind, start = VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])], int(graph.var[v, at.V_AT])
         key, value = int(graph.keys[v]), graph.values[start : start + kind.size]
-        seen = float(value[np.flatnonzero(~(np.abs(value) <= MOST_NUMBER))[0]])
-        return errors.Diverged(f"{kind} {errors.printed(key)}", seen, MOST_NUMBER, key)
+        beyond = np.flatnonzero(~(np.abs(value) <= MOST_NUMBER))
+        if not beyond.size:
+            where = f"the scale of {kind} {errors.printed(key)}"
+            return errors.Diverged(where, float(value[-1]), MOST_NUMBER, key=key, least=LEAST_SCALE)
+        return errors.Diverged(f"{kind} {errors.printed(key)}", float(value[beyond[0]]), MOST_NUMBER, key=key)
     if math.isfinite(report.chi2) and math.isfinite(report.chi2_before):
         return None
     return errors.Diverged("χ²", max(report.chi2, report.chi2_before), math.inf)

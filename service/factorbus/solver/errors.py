@@ -206,8 +206,9 @@ class OutOfBounds(SolverError):
 class Diverged(SolverError):
     code = "diverged"
 
-    def __init__(self, what: str, seen: float, most: float, key: int | None = None) -> None:
-        wanted = f"at most {most:g} in magnitude" if math.isfinite(most) else "a finite number"
+    def __init__(self, what: str, seen: float, most: float, **more: Any) -> None:
+        bounds = f"{more['least']:g} to {most:g}" if "least" in more else f"at most {most:g} in magnitude"
+        wanted = bounds if math.isfinite(most) else "a finite number"
         super().__init__(
             f"the step would leave {what} at {seen:.6g}, wanted {wanted}: what was inserted does not determine "
             "it, or contradicts the map; the map is as it was. Leave the factor out, or add a prior",
@@ -215,7 +216,7 @@ class Diverged(SolverError):
             seen=f"{seen:.6g}",
             wanted=wanted,
             most=most,
-            **({} if key is None else {"key": key}),
+            **more,
         )
 
 

@@ -8,9 +8,9 @@ from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.changes.factor_edit import FactorEdit
 from factorbus.solver.changes.requested import Edits
 from factorbus.solver.errors import KindTaken, SolverError, TooLarge
+from factorbus.solver.graph.escaped import find_beyond
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.model.bounds import find_escaped
 from factorbus.solver.report import StepReport
 from factorbus.solver.stepper import Stepper
 from factorbus.wording import counted
@@ -63,7 +63,7 @@ def _take_back(steps: TreeSteps, edit: FactorEdit, count: tuple[int, int]) -> No
 
 def is_sound(graph: FactorGraph, steps: TreeSteps, report: StepReport) -> bool:
     """Whether everything that the step moved, and χ², is within bounds."""
-    escaped = find_escaped(steps.changed(), graph.array_table) >= 0
+    escaped = find_beyond(steps.changed(), graph) >= 0
     return not escaped and bool(np.isfinite(report.chi2) and np.isfinite(report.chi2_before))
 
 
