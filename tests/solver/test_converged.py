@@ -265,7 +265,7 @@ def test_stiff_links_beside_a_weak_prior_are_taken(sigma: float) -> None:
             solver.chi2(),
             {key: np.array([[c, s], [-s, c]]) @ (row - first)[:2] for key, row in poses.items() if key in range(*X)},
         )
-    assert seen[sigma][0] == pytest.approx(seen[0.0][0], rel=1e-4)
+    assert seen[sigma][0] == pytest.approx(seen[0.0][0], rel=1e-6)
     for key, place in seen[0.0][1].items():
         np.testing.assert_allclose(seen[sigma][1][key], place, atol=1e-2)
 
@@ -273,22 +273,26 @@ def test_stiff_links_beside_a_weak_prior_are_taken(sigma: float) -> None:
 @pytest.mark.parametrize("pairs", [1, 3, 7])
 def test_links_so_stiff_that_pivots_are_raised_do_not_end_a_step(pairs: int) -> None:
     """Σ error² says nothing of a direction whose pivot was raised: it said converged at 1.04 times the optimum."""
-    solver = Solver()
+    solver, plain = Solver(), Solver(BATCH)
     for step in WORLDS["manhattan"](1500, 5):
-        solver.stage(step.batch)
+        for each in (solver, plain):
+            each.stage(step.batch)
     for n in range(pairs):
         at, first, second = f"x{10 + 200 * n}", f"r{2 * n}", f"r{2 * n + 1}"
         draft = Draft().se2(first).se2(second).between_se2(at, first, (1, 0, 0.5), sigmas=(1, 1, 1))
         solver.stage(draft.between_se2(first, second, (1, 0, 0.5), sigmas=(1e-8, 1e-8, 1e-8)).batch())
     report = solver.step()
     said = [report] + [solver.step() for _ in range(8)]
-    optimum = min(settled_apart(solver), said[-1].chi2)
+    # A chain that nothing else holds fits exactly: the optimum is that of the map without it, which has no such link.
+    optimum = plain.step(settle=True).chi2
     for report in said:
         assert not report.converged or report.chi2 <= 1.001 * optimum
-    if pairs == 7:  # Levenberg-Marquardt goes on lowering χ² by a little, further than anybody waits
+    if pairs > 1:  # Levenberg-Marquardt goes on lowering χ² by a little, further than anybody waits
+        assert not said[-1].converged
         return
     assert said[-1].converged
-    assert said[-1].chi2 == pytest.approx(optimum, rel=1e-6)
+    # Rounding of 1e16 in R hides what holds the map: it stops 3e-5 above the optimum, where no step gains anything.
+    assert said[-1].chi2 == pytest.approx(optimum, rel=1e-4)
     # What adds nothing does not take back that it has converged; a loop that pulls does.
     last = 1499
     assert put(
