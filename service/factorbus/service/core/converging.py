@@ -81,6 +81,11 @@ class Converging:
         """The further step was refused: the map is where it was, so the next one would be, too."""
         self._untold, self.gave_up = False, "the solver refused it, see the service's log"
 
+    def try_again(self) -> None:
+        """Further steps may take another time from now on: what was of no use before may be."""
+        self.in_vain, self.gave_up, self.steps, self._spent_s = 0, "", 0, 0.0
+        self._useless = self._still = 0
+
     def undone(self) -> None:
         """What was not published did not happen."""
         self._untold = False
