@@ -75,7 +75,7 @@ def test_a_map_that_gave_up_tries_again() -> None:
     (run,) = core.tick(10.0)
     assert isinstance(run, InsertBatch)
     assert (run.further, run.budget, run.budget_ms) == (True, UNITS, 1.0)
-    core._converging.in_vain, core._converging.gave_up = 5, "of no use"
+    core._converging._in_vain, core._converging.gave_up = 5.0, "of no use"
     core._converging._untold, core._running = False, None
     assert core.tick(20.0) == []
     core.change_budget(4.0, 3.0)

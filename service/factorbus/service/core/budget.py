@@ -44,9 +44,9 @@ class StepBudget:
     def units(self, doubled: int = 0) -> float:
         """What a step that begins now may take, a whole number of units, or that doubled so often; 0: it has no bound.
 
-        doubled: of a further step, how many before it were of no use.
+        doubled: of a further step, as `Converging` has it.
         """
-        if doubled > MOST_DOUBLED or (doubled and self.complete):
+        if doubled > MOST_DOUBLED:
             return 0.0
         return float(round(self.budget_ms * self.units_per_ms)) * 2.0**doubled
 

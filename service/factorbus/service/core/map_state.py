@@ -349,7 +349,7 @@ class MapCore:
                 room = further = keep = False
             inserts = self._admission.take(self._limits.step_inserts) if room else ()
             short = not keep and self._short.is_short(reads, inserts, now)
-            units = self._budget.units(self._converging.in_vain if further else 0)
+            units = self._budget.units(self._converging.doubled if further else 0)
             self._running = InsertBatch(
                 reads, inserts, short, self._must_reload, further, units, keep, self._budget.budget_ms
             )
