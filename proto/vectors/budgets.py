@@ -1,4 +1,5 @@
-"""Golden messages of a map whose steps have a budget, §21: how it is made, what a delta says, and its records;
+"""Golden messages of a map whose steps have a budget, §21: how it is made, how that is changed and taken away, what a
+delta says, and its records;
 and how one is made that keeps some poses, §22."""
 
 import numpy as np
@@ -24,6 +25,8 @@ def messages() -> dict[str, bytes]:
     records = (SentRecord(5, (), further=True, budget=_UNITS), SentRecord(6, (), further=True))
     return {
         "admin_create_budget": codec.encode_map({"map": "kitchen", "mode": "auto", "budget_ms": 10.0}),
+        "admin_budget": codec.encode_map({"map": "kitchen", "budget_ms": 2.5}),
+        "admin_budget_none": codec.encode_map({"map": "kitchen", "budget_ms": 0.0}),
         "admin_create_keep": codec.encode_map({"map": "town", "mode": "auto", "keep": keep_text("per_area=2")}),
         "delta_budget": codec.encode_delta(Delta(_EPOCH, 41, 40, (moved,), report)),
         "records_push_budget": encode_records_push(RecordsPush(place, records)),

@@ -114,15 +114,15 @@ def test_a_further_step_of_no_use_has_the_next_one_take_more() -> None:
     converging.moved_on(False, True, 100.0, BudgetUse(unsolved=50.0, complete=False))
     given_units = []
     for n in range(MOST_DOUBLED + 2):
-        given_units.append(budget.units(converging.in_vain))
+        given_units.append(budget.units(converging.doubled))
         said = step(1e6, 1.0, 1e6, unsolved=50.0, complete=False, chi2=100.0 if n else 90.0, unfinished=True)
         converging.went_on(said)
         budget.stepped(said)
     assert given_units == [1e6, *(1e6 * 2.0**n for n in range(MOST_DOUBLED + 1))]
-    assert budget.units(converging.in_vain) == 0.0, "at last one has no bound"
+    assert budget.units(converging.doubled) == 0.0, "at last one has no bound"
     assert converging.converging, "that is no reason to give up"
     converging.went_on(Stepped(9, b"", "tree", 80.0, 1.0, unfinished=True))
-    assert budget.units(converging.in_vain) == 1e6
+    assert budget.units(converging.doubled) == 1e6
 
 
 def test_what_is_left_tells_of_progress_where_chi2_does_not() -> None:
@@ -132,13 +132,28 @@ def test_what_is_left_tells_of_progress_where_chi2_does_not() -> None:
     for n in range(60):
         said = step(1e6, 1.0, 1e6, unsolved=50.0 * 0.98**n, complete=False, chi2=100.0 + n, unfinished=True)
         converging.went_on(said)
-        assert converging.in_vain == (0 if n else 1)
+        assert converging.doubled == (0 if n else 1)
 
 
-def test_one_that_left_nothing_and_was_of_no_use_is_followed_by_one_without_a_bound() -> None:
-    budget = StepBudget(1.0, 1e6)
-    budget.stepped(step(1e6, 1.0, 1e6))
-    assert (budget.units(0), budget.units(1)) == (1e6, 0.0)
+def test_polishing_keeps_to_the_budget_until_next_to_nothing_is_unsolved() -> None:
+    """Only then has a step no bound: it substitutes back through the map, and relinearizes nothing."""
+    converging, budget, doubled = Converging(), StepBudget(1.0, 1e6), []
+    converging.moved_on(True, True, 100.0, BudgetUse(unsolved=0.01))
+    for n in range(10):
+        doubled.append(converging.doubled)
+        said = step(1e6, 1.0, 1e6, unsolved=0.01, chi2=100.0 if n else 90.0, unfinished=True)
+        converging.went_on(said)
+        budget.stepped(said)
+    assert doubled == [0] * 5 + [1] * 4 + [2], "of no use, and nothing left to defer: a quarter of a doubling each"
+    assert budget.units(converging.doubled) == 4e6
+    converging.went_on(step(1e6, 1.0, 1e6, unsolved=0.9e-6, chi2=90.0, unfinished=True, complete=False))
+    assert budget.units(converging.doubled) == 1e6, "something is left"
+    converging.went_on(step(1e6, 1.0, 1e6, unsolved=0.8e-6, chi2=90.0, unfinished=True))
+    assert budget.units(converging.doubled) == 0.0
+    converging.went_on(Stepped(9, b"", "tree", 80.0, 1.0, unfinished=True))
+    assert budget.units(converging.doubled) == 1e6, "what that has moved is polished within the budget again"
+    converging.moved_on(True, True, 100.0, BudgetUse(unsolved=0.9e-6))
+    assert budget.units(converging.doubled) == 0.0
 
 
 @pytest.mark.parametrize(("complete", "idle_s"), [(False, CONVERGE_IDLE_S), (True, POLISH_IDLE_S)])

@@ -121,6 +121,7 @@ def poke(session: zenoh.Session, name: str) -> None:
 
 INSERT = codec.encode_insert(Insert(1, Batch(), settle=True))
 CREATE = codec.encode_map({"map": "kitchen"})
+BUDGET = codec.encode_map({"map": "none", "budget_ms": 1.0})
 
 # What is tried: a name, the trial, and who it must work for; for everybody else it must not.
 TRIALS: dict[str, tuple[Callable[[Identity], bool], tuple[str, ...]]] = {
@@ -165,6 +166,7 @@ TRIALS: dict[str, tuple[Callable[[Identity], bool], tuple[str, ...]]] = {
     "read the service's statistics": (lambda me: me.answered("admin/stats"), ("ops",)),
     "create a map": (lambda me: me.answered("admin/create", CREATE), ("ops", "boat")),
     "drop a map": (lambda me: me.answered("admin/drop", codec.encode_map({"map": "none"})), ("ops",)),
+    "change a budget": (lambda me: me.answered("admin/budget", BUDGET), ("ops",)),
     "fork a map": (lambda me: me.answered("admin/fork", codec.encode_map({"map": "none", "as": "n"})), ("ops",)),
     "any operation": (lambda me: me.answered("admin/**"), ()),
     "have features made": (lambda me: me.answered("features/s1/ask"), ("robot1", "robot2")),

@@ -3,6 +3,7 @@
 FACTORBUS_KILLS says how often a service is killed; here fewer, to save time.
 """
 
+import asyncio
 import os
 import queue
 import random
@@ -22,10 +23,11 @@ from processes import PATIENCE_S
 from replicas import MAP, Link, check_equal, replica_settings, wait_until_level
 from zenoh.handlers import Callback
 
-from factorbus.client import Map, Refused, connect
+from factorbus.client import Map, Refused, aio, connect
 from factorbus.journal.store import open_store
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import Batch
+from factorbus.proto.problems import BadOption, Problem
 from factorbus.service.config import Limits
 from factorbus.service.core.budget import LARGE
 from factorbus.service.journal.library import make_map_solver
@@ -237,3 +239,96 @@ def test_a_replica_makes_the_same_steps(services: Callable[..., Services], tmp_p
     values = [replayed(tmp_path / end / MAP) for end in ("base", "robot")]
     assert values[0] == values[1]
     assert sum(budget > 0.0 for budget in values[0][1]) > 20
+
+
+@pytest.mark.timeout(900)
+def test_changed_and_killed_it_has_the_same_budget_and_the_same_bits(
+    services: Callable[..., Services], tmp_path: Path
+) -> None:
+    batches = driven_batches(400)
+    running = services(tmp_path / "j")
+    with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("m") as driven:
+        reports = []
+        for n, batch in enumerate(batches[:300]):
+            if n == 100:
+                assert bus.set_budget("m", TIGHT_MS).budget_ms == TIGHT_MS
+            if n == 250:
+                assert bus.set_budget("m", 2 * TIGHT_MS).budget_ms == 2 * TIGHT_MS
+            reports.append(driven.insert(batch).report)
+        assert [r.get("budget_ms") for r in reports] == [None] * 100 + [TIGHT_MS] * 150 + [2 * TIGHT_MS] * 50
+        assert all(("budget" in r) == (n >= 100) for n, r in enumerate(reports))
+        assert not all(report["complete"] for report in reports[100:])
+        assert bus.set_budget("m", TIGHT_MS).budget_ms == TIGHT_MS
+        running.end(signal.SIGKILL)  # nothing was inserted since
+        running.start()
+        assert bus.maps()[0].budget_ms == driven.stats()["budget"]["budget_ms"] == TIGHT_MS
+        row = bus.fork("m", "what-if")
+        assert row.budget_ms == TIGHT_MS
+        assert driven.insert(batches[300]).report["budget_ms"] == TIGHT_MS
+        for batch in batches[301:]:
+            driven.send(batch)
+        driven.flush(PATIENCE_S)
+        assert bus.set_budget("m", None).budget_ms == 0.0
+        stats = services_finish(running, driven)
+        assert not {"budget", "budget_ms", "complete"} & set(stats)
+        assert stats["chi2"] <= optimum(batches) * (1.0 + 1e-6)
+        running.end(signal.SIGKILL)
+        running.start()
+        assert [row.budget_ms for row in sorted(bus.maps(), key=lambda row: row.name)] == [0.0, TIGHT_MS]
+        estimate = rows(driven.ask_estimate().variables)
+    running.end(signal.SIGTERM)
+    values, budgets = replayed(tmp_path / "j" / "m")
+    assert values == estimate
+    assert budgets[:100] == [0.0] * 100
+    assert all(budgets[100:300])
+
+
+def services_finish(running: Services, joined: Map) -> dict[str, Any]:
+    """Until no further step follows, of a map without a budget."""
+    return running.eventually(joined.stats, lambda seen: not seen["converging"])
+
+
+def test_a_change_that_cannot_be_is_refused_whole(services: Callable[..., Services], tmp_path: Path) -> None:
+    endpoint = services(tmp_path / "j").start()
+    with connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus:
+        bus.create("yard", budget_ms=3.0)
+        bus.create("plain", "inc-l")
+        for name, budget_ms, code in (("plain", 2.0, "no_budget"), ("yrad", 2.0, "unknown_map")):
+            with pytest.raises(Problem) as refused:
+                bus.set_budget(name, budget_ms)
+            assert refused.value.code == code
+        for wrong in (-1.0, 1e6, float("nan"), "3", True):
+            with pytest.raises(BadOption):
+                bus.set_budget("yard", wrong)  # type: ignore[arg-type]
+        assert bus.set_budget("plain", 0.0).budget_ms == 0.0
+        assert {row.name: row.budget_ms for row in bus.maps()} == {"m": 0.0, "yard": 3.0, "plain": 0.0}
+        assert asyncio.run(changed_async(endpoint)) == [7.0, 0.0]
+        for budget, said in (("4", "a budget of 4 ms"), ("none", "no bound")):
+            ran = factorbus("budget", "yard", budget, "--connect", endpoint)
+            assert (ran.returncode, ran.stdout) == (0, f"steps of yard have {said}\n")
+        assert factorbus("budget", "yard", "soon", "--connect", endpoint).returncode == 2
+        assert factorbus("budget", "yard", "nan", "--connect", endpoint).returncode != 0
+
+
+async def changed_async(endpoint: str) -> list[float]:
+    async with aio.connect(endpoint, client="robot") as bus:
+        return [(await bus.set_budget("yard", budget_ms)).budget_ms for budget_ms in (7.0, None)]
+
+
+def factorbus(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "factorbus.cli", *arguments], capture_output=True, text=True, timeout=120
+    )
+
+
+def test_without_a_journal_it_is_changed_at_once_and_forked(services: Callable[..., Services]) -> None:
+    batches = driven_batches(60)
+    with connect(services("").start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("m") as driven:
+        driven.insert(batches[0])
+        bus.set_budget("m", TIGHT_MS)
+        assert driven.insert(batches[1]).report["budget_ms"] == TIGHT_MS
+        assert driven.stats()["options"]["budget_ms"] == TIGHT_MS
+        assert bus.fork("m", "what-if").budget_ms == TIGHT_MS
+        bus.set_budget("m", None)
+        assert "budget" not in driven.insert(batches[2]).report
+        assert "budget_ms" not in driven.stats()["options"]

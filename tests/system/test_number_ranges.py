@@ -71,6 +71,7 @@ def messages() -> dict[str, tuple[str, bytes]]:
     made["create"] = keys.admin_key("create"), codec.encode_map({"map": "ranges", "mode": "auto"})
     made["drop"] = keys.admin_key("drop"), codec.encode_map({"map": "nowhere", "revision": 999})
     made["fork"] = keys.admin_key("fork"), codec.encode_map({"map": "ranges", "as": "ranges", "request": 1})
+    made["budget"] = keys.admin_key("budget"), codec.encode_map({"map": "ranges", "budget_ms": 5.0})
     made["features"] = "FEATURES", features_codec.encode_ask(Ask(observations))
     return made
 
@@ -152,6 +153,8 @@ OUTSIDE: list[tuple[str, str, Any, str, str]] = [
     ("ask/why key", "factor", 1, "bad_message", "question"),
     ("create", "mode", "x", "bad_option", "create.mode"),
     ("drop", "revision", -1, "bad_message", "drop.revision"),
+    *[("budget", "budget_ms", bad, "bad_option", "budget.budget_ms") for bad in (NAN, INF, -1, -TINY, 60_000.1)],
+    ("budget", "budget_ms", None, "bad_message", "budget.budget_ms"),
     ("fork", "request", 2**63, "bad_message", "fork.request"),
 ]
 

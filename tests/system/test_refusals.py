@@ -160,6 +160,9 @@ def test_what_is_not_there_says_so(client: Bare, key: str, code: str) -> None:
         ("create", {"map": "a/b"}, "bad_name"),
         ("create", {"map": "a", "mode": "magic"}, "bad_option"),
         ("drop", {"map": "nowhere"}, "unknown_map"),
+        ("budget", {"map": "nowhere", "budget_ms": 1.0}, "unknown_map"),
+        ("budget", {"map": "nowhere"}, "bad_message"),
+        ("budget", {"map": "nowhere", "budget_ms": -1.0}, "bad_option"),
     ],
 )
 def test_administration_refuses_too(client: Bare, operation: str, content: dict[str, Any], code: str) -> None:

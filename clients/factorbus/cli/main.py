@@ -39,6 +39,7 @@ COMMANDS = {
     "export": ("export", "Copy a map out of a service's journal into one file."),
     "import": ("import_command", "Put an exported map into a service's journal."),
     "drop": ("drop", "Take a map off its service, if it is at the revision that was copied."),
+    "budget": ("budget", "What a step of a map may take: set, change or remove it."),
     "warm": ("warm", "Compile the kernels ahead."),
     "access": ("access", "Write who may do what as a Zenoh configuration: TLS, users, access control."),
     "stats": ("stats", "What services count and time, asked over the bus."),

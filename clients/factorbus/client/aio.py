@@ -119,6 +119,10 @@ class Bus:
         """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName, BadOption, NotSupported."""
         return await asyncio.to_thread(self._bus.create, name, mode, closures=closures, budget_ms=budget_ms, keep=keep)
 
+    async def set_budget(self, name: str, budget_ms: float | None) -> MapRow:
+        """Give the steps of map `name` another budget; None: no bound.  Raises as `factorbus.client.Bus.set_budget`."""
+        return await asyncio.to_thread(self._bus.set_budget, name, budget_ms)
+
     async def fork(self, name: str, target: str) -> MapRow:
         """A new map that begins as `name` is now.  Raises as `factorbus.client.Bus.fork`."""
         return await asyncio.to_thread(self._bus.fork, name, target)

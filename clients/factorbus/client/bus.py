@@ -15,6 +15,7 @@ from factorbus.client.permission import inserts_pass
 from factorbus.client.query_all import query_all
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, fields, keys
+from factorbus.proto.budget import checked_budget
 from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
 from factorbus.proto.interest import Interest, checked_interest
@@ -185,6 +186,19 @@ class Bus:
         if asked["keep"] not in (None, row.keep):
             raise NotSupported("a map that keeps some poses alone", str(row.protocol.get("product", "")))
         return row
+
+    def set_budget(self, name: str, budget_ms: float | None, timeout_s: float | None = None) -> MapRow:
+        """Give the steps of map `name` another budget, from the next one on: its row, once a restart would know it.
+
+        budget_ms: what a step may take, in milliseconds, up to a minute; None or 0: there is no bound, and what earlier
+        steps have left is done.  A replica and its upstream have a budget each: this changes one of them.
+        Raises Refused (no_budget, journal_failed, ...), Unavailable, BadName, BadOption, UnknownMap.
+        """
+        asked = {"map": keys.checked_name("map", name), "budget_ms": checked_budget(budget_ms)}
+        try:
+            return self._admin("budget", asked, _row, timeout_s)
+        except Refused as refused:
+            raise self._named(name, refused) from None
 
     def fork(self, name: str, target: str, timeout_s: float | None = None) -> MapRow:
         """A new map `target` that begins as map `name` is now: a what-if, which may be tried out and dropped.

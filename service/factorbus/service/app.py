@@ -59,7 +59,7 @@ from factorbus.service.operations.metrics import open_metrics
 from factorbus.service.operations.start import ready_to_compute
 from factorbus.service.process.health import Health
 from factorbus.service.process.worker_threads import WorkerThreads
-from factorbus.service.questions.admin import NotHere, read_create, read_drop, read_fork
+from factorbus.service.questions.admin import NotHere, read_budget, read_create, read_drop, read_fork
 from factorbus.service.questions.answers import Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.registry import Maps
@@ -354,10 +354,12 @@ class Shell:
                 self.maps.fork(query, read_fork(payload))
             elif operation == "drop":
                 self.maps.drop(query, read_drop(payload))
+            elif operation == "budget":
+                self.maps.change_budget(query, read_budget(payload))
             elif self._config.connect:
                 ignore(query)  # another service at the router may know it
             else:
-                raise UnknownQuestion(f"admin/{operation}", "maps, stats, create, fork or drop")
+                raise UnknownQuestion(f"admin/{operation}", "maps, stats, create, fork, drop or budget")
         except NotHere as problem:
             if self._config.connect:
                 ignore(query)  # for another service at the router

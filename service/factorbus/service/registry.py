@@ -20,12 +20,14 @@ from factorbus.service.config import Config
 from factorbus.service.core.events import Asker, Read
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.journal.library import CopiedAt, Kept, Library, made_as_of
+from factorbus.service.maps.budget_change import change_budget
 from factorbus.service.maps.host import Host
 from factorbus.service.maps.making import MapMaker
 from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.process.heap import give_back
 from factorbus.service.process.memory import MemoryLimit, OutOfMemory
 from factorbus.service.questions.admin import (
+    BudgetChange,
     Drop,
     Fork,
     KeptElsewhere,
@@ -33,6 +35,7 @@ from factorbus.service.questions.admin import (
     MapExists,
     NotDamaged,
     NotHere,
+    check_budget,
     check_made_as,
     ours,
     settled_mode,
@@ -59,7 +62,7 @@ class _Forking:
 class OpenMap:
     """A map, its place on the bus, and the end of it."""
 
-    def __init__(self, host: Host, place: MapPlace, options: dict[str, Any]) -> None:
+    def __init__(self, host: Host, place: MapPlace, options: Callable[[], dict[str, Any]]) -> None:
         self.host, self.place, self.options = host, place, options
         self.drained = threading.Event()
         self.on_drained: Callable[[], None] = self.drained.set
@@ -163,7 +166,7 @@ class Maps:
         """The row of map `name`, made if it is not there.  Raises Problem."""
         asked = asked._replace(mode=asked.mode and settled_mode(asked.mode))
         if found := self._maps.get(name):
-            check_made_as(name, made_as_of(found.host.core.mode, found.options), asked)
+            check_made_as(name, made_as_of(found.host.core.mode, found.options()), asked)
             return found.host.core.row()
         if not ours(self._config.maps, keys.checked_name("map", name)):
             raise NotHere(name, self._config.maps)
@@ -178,10 +181,7 @@ class Maps:
 
     def fork(self, asker: Asker, fork: Fork) -> None:
         """Have a new map begin as another one is, and answer with its row: `forked` goes on.  Raises Problem."""
-        if not ours(self._config.maps, fork.source):
-            raise NotHere(fork.source, self._config.maps)
-        if (found := self.find(fork.source)) is None:
-            raise self._unopened.get(fork.source) or UnknownMap(fork.source)
+        found = self._there(fork.source)
         if self._answered_again(asker, fork):
             return
         self._check_new(fork.target)
@@ -202,6 +202,21 @@ class Maps:
         self._forks[asked.fork.target] = asked.fork
         self._delivery.answer(asker, codec.encode_map(row | {"protocol": known()}))
         self._control.hand(give_back)
+
+    def change_budget(self, asker: Asker, asked: BudgetChange) -> None:
+        """Give the steps of a map another budget, and answer with its row when the journal has it.  Raises Problem."""
+        host = self._there(asked.name).host
+        check_budget(host.core.mode, asked.budget_ms)
+        if self._stopping:
+            raise ShuttingDown
+
+        def done(problem: Problem | None) -> None:
+            if problem is not None:
+                self._delivery.refuse(asker, problem)
+            else:
+                self._delivery.answer(asker, codec.encode_map(host.core.row() | {"protocol": known()}))
+
+        change_budget(host, asked.budget_ms, self._maker.units_per_ms, done)
 
     def drop(self, asker: Asker, drop: Drop) -> None:
         """Drop a map as `drop` says, and answer when it is gone.
@@ -270,6 +285,14 @@ class Maps:
         for found in self._maps.values():
             found.place.close()
 
+    def _there(self, name: str) -> OpenMap:
+        """Map `name`, which is ours and open.  Raises Problem."""
+        if not ours(self._config.maps, name):
+            raise NotHere(name, self._config.maps)
+        if (found := self.find(name)) is None:
+            raise self._unopened.get(name) or UnknownMap(name)
+        return found
+
     def _make(self, name: str, asked: MadeAs = _WHICHEVER) -> OpenMap:
         """Raises Problem."""
         if problem := self._unopened.get(name):
@@ -279,15 +302,15 @@ class Maps:
     def _at_work(self, core: MapCore, map_solver: MapSolver, kept: Kept | None) -> OpenMap:
         name = core.name
         map_solver.bound(Room(self._memory, self._config.limits.answer_bytes))
-        place, options = self._bus.place(name, self._service), map_solver.options()
+        place = self._bus.place(name, self._service)
 
         def more() -> dict[str, Any]:
-            return {"options": options, **made.host.journal()}
+            return {"options": map_solver.options(), **made.host.journal()}
 
         by = self._delivery.of_map(place, more, lambda: made.on_drained())
         host = Host(core, map_solver, by.perform, by.send, by.answer_reads, self._inline_run, by.send_both, kept)
         by.interests = self._delivery.interests.of_map(name, place, host.read)
-        made = OpenMap(host, place, options)
+        made = OpenMap(host, place, map_solver.options)
         return made
 
     def _open(self, name: str, made: OpenMap) -> dict[str, Any]:
@@ -339,7 +362,7 @@ class Maps:
         if found is None or found.host.core.epoch != asked.epoch:
             raise UnknownMap(fork.source)
         copy = CopiedAt(taken.record, copied.state, found.host.core.differs or "")
-        return self._at_work(*self._maker.fork(fork, found.host.core, found.options, copy))
+        return self._at_work(*self._maker.fork(fork, found.host.core, found.options(), copy))
 
     def _dropped(self, asker: Asker, found: OpenMap) -> None:
         name = found.host.core.name

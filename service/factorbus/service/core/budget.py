@@ -33,6 +33,7 @@ class StepBudget:
         self.budget_ms, self.units_per_ms = budget_ms, units_per_ms
         self._began = units_per_ms
         self._use, self._step_ms = _NONE, 0.0
+        self._ends = False  # the map had a budget, and what that left is not done yet
         self._coming = False  # a large correction, and the event has gone out
 
     @property
@@ -43,11 +44,21 @@ class StepBudget:
     def units(self, doubled: int = 0) -> float:
         """What a step that begins now may take, a whole number of units, or that doubled so often; 0: it has no bound.
 
-        doubled: of a further step, how many before it were of no use.
+        doubled: of a further step, as `Converging` has it.
         """
-        if doubled > MOST_DOUBLED or (doubled and self.complete):
+        if doubled > MOST_DOUBLED:
             return 0.0
         return float(round(self.budget_ms * self.units_per_ms)) * 2.0**doubled
+
+    def change(self, budget_ms: float, units_per_ms: float) -> None:
+        """Steps that begin from now on have this budget; 0: no bound, and what was left goes on.
+
+        units_per_ms: as measured, for a map that had none; of one that had, what steps have led to stays.
+        """
+        if not self.budget_ms:
+            self.units_per_ms = self._began = units_per_ms
+        self._ends = not budget_ms and not self.complete and bool(self.budget_ms or self._ends)
+        self.budget_ms = budget_ms
 
     def restore(self, use: BudgetUse) -> None:
         """The map was here before, and this is known of its last step."""
@@ -55,9 +66,12 @@ class StepBudget:
 
     def stepped(self, stepped: Stepped) -> None:
         """A step was made."""
-        if not self.budget_ms:
+        if not self.budget_ms and not self._ends:
             return
         self._use, self._step_ms = stepped.use or _NONE, stepped.step_ms
+        self._ends = self._ends and not self.complete
+        if not self.budget_ms:
+            return
         if stepped.use is not None and stepped.strategy != "batch":  # what replaces a step is not counted in units
             self._follow(stepped.use, stepped.step_ms)
 
@@ -85,8 +99,9 @@ class StepBudget:
         self.units_per_ms = min(max(rate, self._began / FAR), self._began * FAR)
 
     def row(self) -> dict[str, Any]:
-        """What the row of a map says of it: nothing where there is none."""
-        return {"budget_ms": self.budget_ms, "complete": self.complete} if self.budget_ms else {}
+        """What the row of a map says of it: nothing where there is none, and no more to do of one that there was."""
+        said = self.budget_ms or self._ends
+        return {"budget_ms": self.budget_ms, "complete": self.complete} if said else {}
 
     def stats(self) -> dict[str, Any]:
         """What else the statistics of a map say."""

@@ -11,6 +11,7 @@ Reasons and figures: docs/decisions/further-steps.md.
 
 import math
 
+from factorbus.service.core.budget import MOST_DOUBLED
 from factorbus.service.core.events import BudgetUse, Stepped
 from factorbus.wording import counted
 
@@ -24,6 +25,8 @@ MOST, MOST_S = 10_000, 300.0  # further steps in a row, and the seconds of a cor
 _SHARE, _NOTHING = 1e-7, 1e-12
 _USELESS, _STILL = 20, 3  # steps in a row
 _LESS = 0.01  # by which share a step with a budget has to lessen what is left, where χ² says nothing
+_WHOLE = 0.25  # of a doubling: what a step of no use adds where nothing is left to defer
+_SOLVED = 1e-8  # of χ²: where no more is unsolved, all that is left is to substitute back through the whole map
 
 
 class Converging:
@@ -40,13 +43,19 @@ class Converging:
         self._busy_at = self._rests_until = -math.inf
         self._spent_s = 0.0
         self._least, self._useless, self._still = math.inf, 0, 0
-        self.in_vain = 0  # further steps in a row that had a budget, and were of no use with it
+        self._in_vain = 0.0  # doublings: of further steps in a row that had a budget, and were of no use with it
+        self._solved = False  # the last step had a budget, and found next to nothing to solve
         self._complete, self._unsolved = True, math.inf  # of the last step with a budget; the least since
 
     @property
     def converging(self) -> bool:
         """Will have further steps by itself, unless an insert comes first."""
         return self._unfinished and not self.gave_up
+
+    @property
+    def doubled(self) -> int:
+        """How often the budget of the next further step is doubled; more than MOST_DOUBLED: it has no bound."""
+        return MOST_DOUBLED + 1 if self._solved else int(self._in_vain)
 
     def is_due(self, now: float) -> bool:
         """Whether the solver, which is free, is to take a further step now."""
@@ -81,6 +90,11 @@ class Converging:
         """The further step was refused: the map is where it was, so the next one would be, too."""
         self._untold, self.gave_up = False, "the solver refused it, see the service's log"
 
+    def try_again(self) -> None:
+        """Further steps may take another time from now on: what was of no use before may be."""
+        self._in_vain, self.gave_up, self.steps, self._spent_s = 0.0, "", 0, 0.0
+        self._useless = self._still = 0
+
     def undone(self) -> None:
         """What was not published did not happen."""
         self._untold = False
@@ -90,7 +104,8 @@ class Converging:
         self.converged, self._unfinished, self.gave_up = converged, unfinished or not converged, ""
         self.steps, self._spent_s = 0, 0.0
         self._least, self._useless, self._still = chi2, 0, 0
-        self.in_vain, self._complete = 0, use is None or use.complete
+        self._in_vain, self._complete = 0.0, use is None or use.complete
+        self._solved = use is not None and _is_solved(use, chi2)
         self._unsolved = math.inf if use is None else use.unsolved
 
     def went_on(self, stepped: Stepped) -> None:
@@ -103,9 +118,10 @@ class Converging:
             self._least = stepped.chi2
         self._complete = stepped.use is None or stepped.use.complete
         if stepped.use is not None:
+            self._solved = _is_solved(stepped.use, stepped.chi2)
             self._went_on_within(stepped.use, useful)
             return
-        self.in_vain, self._unsolved = 0, math.inf
+        self._solved, self._in_vain, self._unsolved = False, 0.0, math.inf
         self._useless = 0 if useful else self._useless + 1
         self._still = self._still + 1 if not stepped.changed else 0
         if self._unfinished and not self.gave_up:
@@ -118,7 +134,7 @@ class Converging:
         """
         useful = useful or use.unsolved < (1.0 - _LESS) * self._unsolved
         self._unsolved = min(use.unsolved, self._unsolved)
-        self.in_vain = 0 if useful else self.in_vain + 1
+        self._in_vain = 0.0 if useful else self._in_vain + (_WHOLE if use.complete else 1.0)
         if self._unfinished and (self.steps >= MOST or self._spent_s >= MOST_S):
             self.gave_up = self._too_many()
 
@@ -137,3 +153,7 @@ class Converging:
     def _too_many(self) -> str:
         steps = counted(self.steps, "further step")
         return f"it was not at its optimum after {steps} in a row, which took {self._spent_s:.0f} s of a core"
+
+
+def _is_solved(use: BudgetUse, chi2: float) -> bool:
+    return use.complete and use.unsolved <= _SOLVED * chi2 + _NOTHING

@@ -247,7 +247,7 @@ class InsertBatch(NamedTuple):
     short: most likely done sooner than another thread would have taken it over.  reload: first of all, go back to what
     the journal has.  further: there are no inserts, and one step is to go on from the last one.  budget: what each step
     may take, in units of the solver's work; 0: it has no bound.  keep: there are no inserts, and the map is to look for
-    poses that it has enough of; the insert that takes them out is its own.
+    poses that it has enough of; the insert that takes them out is its own.  budget_ms: what the budget is of.
     """
 
     reads: tuple[Read, ...]
@@ -257,6 +257,7 @@ class InsertBatch(NamedTuple):
     further: bool = False
     budget: float = 0.0
     keep: bool = False
+    budget_ms: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

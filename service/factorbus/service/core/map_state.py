@@ -109,10 +109,7 @@ class MapCore:
         effects = self._admission.expire(arrived.now)
         admitted = self._admission.admit(arrived)
         self._statistics.received(arrived.size)
-        for effect in admitted:
-            if isinstance(effect, Refuse):
-                self._statistics.refused(effect.problem)
-        return self._go_on(effects + admitted, arrived.now)
+        return self._go_on(effects + self._statistics.count_refused(admitted), arrived.now)
 
     def unread(self, client: str, refuse: Refuse) -> list[Effect]:
         """An insert of `client` came in of which not even the number can be read."""
@@ -184,13 +181,13 @@ class MapCore:
     def block(self, problem: Problem, now: float) -> list[Effect]:
         """The journal cannot be written: nothing new is taken in, and what has not gone to the solver is refused."""
         self._admission.block(problem)
-        effects = self._count_refused(self._admission.take_back(problem, given=False))
+        effects = self._statistics.count_refused(self._admission.take_back(problem, given=False))
         return self._go_on([*effects, self._event("blocked")], now)
 
     def unkept(self, problem: Problem, now: float) -> list[Effect]:
         """The same, and what came of Runs since the last `kept` did not happen: the solver is to go back."""
         self._admission.block(problem)
-        effects = self._count_refused(self._admission.take_back(problem, given=True))
+        effects = self._statistics.count_refused(self._admission.take_back(problem, given=True))
         self._unanswered = self._unanswered_bytes = 0
         self._converging.undone()
         self.removals.undone()
@@ -285,6 +282,11 @@ class MapCore:
         self._converging.look(now)
         return self._go_on(self._admission.expire(now), now)
 
+    def change_budget(self, budget_ms: float, units_per_ms: float) -> None:
+        """Steps that begin from now on have this budget, also those that finish what is left; 0: no bound."""
+        self._budget.change(budget_ms, units_per_ms)
+        self._converging.try_again()
+
     def stop(self, now: float) -> list[Effect]:
         """Take nothing new; Drained comes when everything accepted is answered."""
         self._closing = ShuttingDown()
@@ -347,8 +349,10 @@ class MapCore:
                 room = further = keep = False
             inserts = self._admission.take(self._limits.step_inserts) if room else ()
             short = not keep and self._short.is_short(reads, inserts, now)
-            units = self._budget.units(self._converging.in_vain if further else 0)
-            self._running = InsertBatch(reads, inserts, short, self._must_reload, further, units, keep)
+            units = self._budget.units(self._converging.doubled if further else 0)
+            self._running = InsertBatch(
+                reads, inserts, short, self._must_reload, further, units, keep, self._budget.budget_ms
+            )
             self.removals.began(keep)
             if inserts or further:
                 self._converging.began(further)
@@ -388,13 +392,9 @@ class MapCore:
         self._converging.began(False)
         self._unanswered += 1
         self._unanswered_bytes += arrived.size
-        self._running = run = InsertBatch((), (arrived,), True, budget=self._budget.units())
+        units, budget_ms = self._budget.units(), self._budget.budget_ms
+        self._running = run = InsertBatch((), (arrived,), True, budget=units, budget_ms=budget_ms)
         return run
-
-    def _count_refused(self, effects: list[Effect]) -> list[Effect]:
-        for refused in (effect for effect in effects if isinstance(effect, Refuse)):
-            self._statistics.refused(refused.problem)
-        return effects
 
     def _event(self, what: str) -> Publish:
         return Publish("event", codec.encode_map({"event": what, "epoch": self.epoch, "revision": self.revision}))

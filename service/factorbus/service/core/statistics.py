@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from factorbus.service.core.events import Effect, Refuse
+
 # As many as may be noted before they are counted in any case; the clock comes four times a second.
 _NOTED = 1024
 
@@ -54,6 +56,13 @@ class MapStatistics:
     def refused(self, problem: Any) -> None:
         """An insert was: a problem with a code."""
         self._refusals[problem.code] += 1
+
+    def count_refused(self, effects: list[Effect]) -> list[Effect]:
+        """`effects`, of which those that refuse something are counted."""
+        for effect in effects:
+            if isinstance(effect, Refuse):
+                self.refused(effect.problem)
+        return effects
 
     def stepped(self, strategy: str, chi2: float, solver_ms: float, published_bytes: int) -> None:
         """The solver made a step; its delta has `published_bytes` bytes."""

@@ -59,7 +59,7 @@ class Keeper:
         self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, checkpoint: CheckpointPlan,
         begin: Callable[[Store], None] = lambda _: None,
     ) -> None:  # fmt: skip
-        self._store, self._listener = store, listener
+        self.store, self._listener = store, listener
         self.folder, self._durability = store.path.parent, durability
         self._pause_s = {"commit": 0.0, "group": group_s, "none": _NONE_S}[durability]
         self._begin, self._begun = begin, False
@@ -170,16 +170,16 @@ class Keeper:
         self._thread.join()
         if self._checkpoint.thread is not None:
             self._checkpoint.thread.join()
-        if self._problem is None and self._store.writable:
+        if self._problem is None and self.store.writable:
             try:
                 if dump is not None and self._checkpoint.steps_s > 0.1 * self._checkpoint.every_s:
                     self._write_checkpoint(dump(), self._number, self._life)
                 self._note_checkpoints()
-                note_upstream(self._store, self.upstream)
-                self._store.end()
+                note_upstream(self.store, self.upstream)
+                self.store.end()
             except JournalFailed as problem:
                 log.error("%s", problem)
-        self._store.close()
+        self.store.close()
 
     # ---- on the journal's thread ------------------------------------------------------------------------------------
 
@@ -260,7 +260,7 @@ class Keeper:
             raise problem
 
     def _rewrite(self, last: Last, records: Sequence[JournalRecord], place: UpstreamPlace | None) -> None:
-        gone = rewrite(self._store, last, records, place, present_build())
+        gone = rewrite(self.store, last, records, place, present_build())
         for record in gone:
             file_of(self.folder, record).unlink(missing_ok=True)
         grew = last.record == self.last.record
@@ -274,7 +274,7 @@ class Keeper:
 
     def _append(self, records: list[JournalRecord]) -> None:
         started = time.perf_counter()
-        self._store.append(records)
+        self.store.append(records)
         took = time.perf_counter() - started
         self._commits += 1
         self._commit_s += took
@@ -317,7 +317,7 @@ class Keeper:
         while self._write(batch) is not None:
             if self._ending.wait(pause_s):
                 lost = sum(len(item.inserts) for item in batch if isinstance(item, HandedBatch))
-                log.error("%s: %d inserts and more that were answered are not written", self._store.path, lost)
+                log.error("%s: %d inserts and more that were answered are not written", self.store.path, lost)
                 return False
             pause_s = min(2 * pause_s, longest_s)
         self._recovered()
@@ -325,14 +325,14 @@ class Keeper:
 
     def _recovered(self) -> None:
         self._problem = None
-        log.info("%s can be written again", self._store.path)
+        log.info("%s can be written again", self.store.path)
         self._listener.unblocked()
 
     def _is_writable(self) -> bool:
         try:
             if not self._begun:
                 self._reopen()
-            self._store.probe()
+            self.store.probe()
         except (JournalFailed, JournalDamaged, JournalUnreadable, JournalVersion, NoJournal) as problem:
             log.debug("still not: %s", problem)
             return False
@@ -340,11 +340,11 @@ class Keeper:
 
     def _try_to_begin(self) -> JournalFailed | None:
         """Write what has to be there before anything else, unless it is; gives why that cannot be done."""
-        if not self._store.writable:
-            return JournalFailed(self._store.path, "it is read-only")
+        if not self.store.writable:
+            return JournalFailed(self.store.path, "it is read-only")
         if not self._begun:
             try:
-                self._begin(self._store)
+                self._begin(self.store)
             except JournalFailed as problem:
                 return problem
             self._begun = True
@@ -352,10 +352,10 @@ class Keeper:
 
     def _reopen(self) -> None:
         # The old one is closed first: in one process, what is open for reading keeps all others from writing.
-        self._store.close()
-        self._store = open_store(self.folder, self._durability)
-        if not self._store.writable:
-            raise JournalFailed(self._store.path, "it is read-only")
+        self.store.close()
+        self.store = open_store(self.folder, self._durability)
+        if not self.store.writable:
+            raise JournalFailed(self.store.path, "it is read-only")
 
     # ---- checkpoints ------------------------------------------------------------------------------------------------
 
@@ -380,8 +380,8 @@ class Keeper:
             file_of(self.folder, saved.record).unlink(missing_ok=True)
             return
         try:
-            old = self._store.add_checkpoint(saved, _KEPT_CHECKPOINTS, self.upstream.record if self.upstream else 0)
-            note_upstream(self._store, self.upstream)
+            old = self.store.add_checkpoint(saved, _KEPT_CHECKPOINTS, self.upstream.record if self.upstream else 0)
+            note_upstream(self.store, self.upstream)
         except JournalFailed as problem:
             log.warning("checkpoint %d is not noted: %s", saved.record, problem)
             file_of(self.folder, saved.record).unlink(missing_ok=True)

@@ -143,6 +143,12 @@ class Host:
         """Put records of another journal into this one; `asker` gets a RecordsAnswer."""
         self.read(Read(Question("graft", ask=graft), asker))
 
+    def change_budget(self, budget_ms: float, units_per_ms: float) -> None:
+        """Steps that begin from now on have this budget; 0: no bound.  The journal has it."""
+        with self._lock:
+            self._map_solver.change_budget(budget_ms)
+            self.core.change_budget(budget_ms, units_per_ms)
+
     @property
     def keeper(self) -> Keeper | None:
         """What writes the journal, if there is one."""
@@ -251,7 +257,7 @@ class Host:
                 return
             if run.reads:
                 self._read(run.reads)
-            self._map_solver.allow(run.budget)
+            self._map_solver.allow(run.budget, run.budget_ms)
             events = self._map_solver.apply_batch(run.inserts, run.further)
             if not isinstance(events, SingleInsertResult):
                 self._tell(events, tell)
@@ -307,7 +313,7 @@ class Host:
             self._graft(run.reads[0], keeper)
         elif run.reads:
             self._read(run.reads)
-        self._map_solver.allow(run.budget)
+        self._map_solver.allow(run.budget, run.budget_ms)
         events, applied = self._map_solver.apply_whole(run.inserts, run.further)
         keeper.hand(run.inserts, events, run.further, run.budget)
         if not keeper.waits:

@@ -32,6 +32,10 @@ class MapMaker:
         if config.budget_ms:
             self._rate.units_per_ms()  # before there is anybody who would wait for it
 
+    def units_per_ms(self) -> float:
+        """Units of work that a step does in a millisecond, as measured where the service starts."""
+        return self._rate.units_per_ms()
+
     def begin(self, name: str, asked: MadeAs) -> tuple[MapCore, MapSolver, Kept | None]:
         """As it was, or new.  Raises Problem."""
         limits, library = self._config.limits, self._library

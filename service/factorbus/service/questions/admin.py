@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from factorbus.proto import codec, fields
-from factorbus.proto.budget import BUDGET_SPAN_MS, BUDGET_WANTED
+from factorbus.proto.budget import BUDGET_OPTION, BUDGET_SPAN_MS, BUDGET_WANTED
 from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.keep import KEEP_ALL, keep_text
 from factorbus.proto.keys import checked_name
@@ -43,7 +43,8 @@ class OtherBudget(Problem):
     def __init__(self, name: str, budget_ms: float, wanted: float) -> None:
         has = f"a budget of {budget_ms:g} ms" if budget_ms else "no budget"
         super().__init__(
-            f"the steps of map {name!r} have {has}, not {wanted:g} ms, and keep it; join it with that, or drop it",
+            f"the steps of map {name!r} have {has}, not {wanted:g} ms; join it with that, or change it first: "
+            "admin/budget, `factorbus budget`",
             budget_ms=budget_ms,
         )
 
@@ -60,13 +61,13 @@ class OtherKeep(Problem):
 
 
 class NoBudget(Problem):
-    """A map was to be made whose steps have a budget, in a mode in which they cannot have one."""
+    """Steps of a map were to have a budget, in a mode in which they cannot have one."""
 
     code = "no_budget"
 
     def __init__(self, mode: str) -> None:
         super().__init__(
-            f"steps in mode {mode} have no budget: they do all there is to do; leave out `budget_ms`, or make the map "
+            f"steps in mode {mode} have no budget: they do all there is to do; leave out `budget_ms`, or make a map "
             "in mode bayes-tree",
             mode=mode,
         )
@@ -190,6 +191,21 @@ def read_drop(payload: bytes) -> Drop:
     return Drop(_map_name(content, "drop"), revision, damaged)
 
 
+class BudgetChange(NamedTuple):
+    """The steps of map `name` are to have this budget; 0: no bound."""
+
+    name: str
+    budget_ms: float
+
+
+def read_budget(payload: bytes) -> BudgetChange:
+    """What an admin/budget asks for.  Raises BadMessage, BadOption, BadName, TooLarge."""
+    content = codec.decode_map(payload, REQUEST_LIMITS, what="budget")
+    name = _map_name(content, "budget")
+    fields.number("budget", content, BUDGET_OPTION)  # has to be there: a field left out is not "none"
+    return BudgetChange(name, fields.parameter("budget", content, BUDGET_OPTION, BUDGET_SPAN_MS, BUDGET_WANTED, 0.0))
+
+
 def read_fork(payload: bytes) -> Fork:
     """What an admin/fork asks for.  Raises BadMessage, BadName, TooLarge."""
     content = codec.decode_map(payload, REQUEST_LIMITS, what="fork")
@@ -212,12 +228,17 @@ def check_made_as(name: str, made_as: MadeAs, asked: MadeAs) -> None:
 def settled(asked: MadeAs, closures: str, budget_ms: float, keep: str = KEEP_ALL) -> MadeAs:
     """How a new map is made that is asked for so, by a service with these for new maps.  Raises NoBudget."""
     mode = settled_mode(asked.mode or "auto")
-    if asked.budget_ms and not mode_named(mode).tree:
-        raise NoBudget(mode)
+    check_budget(mode, asked.budget_ms)
     own = budget_ms if mode_named(mode).tree else 0.0
     return MadeAs(
         mode, asked.closures or closures, own if asked.budget_ms is None else asked.budget_ms, asked.keep or keep
     )
+
+
+def check_budget(mode: str, budget_ms: float | None) -> None:
+    """Can steps in `mode` have that budget?  Raises NoBudget."""
+    if budget_ms and not mode_named(mode).tree:
+        raise NoBudget(mode)
 
 
 def settled_mode(mode: str) -> str:

@@ -68,10 +68,20 @@ class Holding:
         self._room = Room()
         self._messages = StepMessages()
         self._budget: float | None = None  # of every step, as `Solver.step` has it
+        self._budget_ms = 0.0  # what that is of, for reports; 0: not said
 
-    def allow(self, budget: float) -> None:
-        """What each step of what is applied next may take, in units of work; 0: as the solver's own settings say."""
+    def allow(self, budget: float, budget_ms: float | None = None) -> None:
+        """What each step of what is applied next may take, in units of work; 0: as the solver's own settings say.
+
+        budget_ms: what that is of; None: what the map's settings say.
+        """
         self._budget = budget or None
+        self._budget_ms = float(self._options.get(BUDGET_OPTION, 0.0)) if budget_ms is None else budget_ms
+
+    def change_budget(self, budget_ms: float) -> None:
+        """The map's settings say this from now on.  From any thread: what it has is given with each `allow`."""
+        others = {name: value for name, value in self._options.items() if name != BUDGET_OPTION}
+        self._options = others | ({BUDGET_OPTION: budget_ms} if budget_ms else {})
 
     def bound(self, room: Room) -> None:
         """Questions may take no more than this."""
@@ -227,8 +237,8 @@ class Holding:
         self._last_report, self._uncertain = reported, None
         self._converged, self._unfinished = _has_converged(reported), bool(self._solver.unfinished)
         reported["converging"] = self._unfinished or not self._converged
-        if "budget" in reported and (budget_ms := self._options.get(BUDGET_OPTION)):
-            reported["budget_ms"] = budget_ms
+        if "budget" in reported and self._budget_ms:
+            reported["budget_ms"] = self._budget_ms
 
     def _fault(self) -> str:
         """Log what is being handled; the reference under which it is found."""
