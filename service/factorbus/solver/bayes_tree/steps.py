@@ -236,8 +236,9 @@ class TreeSteps:
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum: nothing by the
             # tree's own step, too, which may take off what damped ones cannot.  It says nothing where the tree could
             # not be eliminated where these ended, and is elsewhere.
-            there = tree.totals.item(tl.T_CHI2) <= (1.0 + _AT_END) * result.chi2 + LEAST_CHI2
-            if goes_on and there and chi2_before - tree.totals.item(tl.T_CHI2) <= _AT_END * self._share:
+            chi2 = tree.totals.item(tl.T_CHI2)
+            there = goes_on and chi2 <= (1.0 + _AT_END) * result.chi2 + LEAST_CHI2
+            if there and chi2_before - chi2 <= _AT_END * self._share:
                 result.converged = True
             if result:
                 tree.totals[tl.T_WHOLE], tree.state[tl.S_AFTER] = tree.totals[tl.T_CHI2], 0
