@@ -25,11 +25,12 @@ from collections.abc import Callable
 from contextlib import closing
 from typing import Any
 
-from factorbus.proto import codec, keys
+from factorbus.proto import keys
 from factorbus.proto.messages import Insert
-from factorbus.proto.problems import Busy, Internal, Problem, UnknownQuestion
+from factorbus.proto.problems import Busy, Problem
 from factorbus.proto.protocol import known
 from factorbus.proto.version import __version__
+from factorbus.service.administration import Administration
 from factorbus.service.bus.delivery import Delivery
 from factorbus.service.bus.senders import Senders
 from factorbus.service.bus.zenoh_session import (
@@ -59,7 +60,6 @@ from factorbus.service.operations.metrics import open_metrics
 from factorbus.service.operations.start import ready_to_compute
 from factorbus.service.process.health import Health
 from factorbus.service.process.worker_threads import WorkerThreads
-from factorbus.service.questions.admin import NotHere, read_budget, read_create, read_drop, read_fork
 from factorbus.service.questions.answers import Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.registry import Maps
@@ -148,6 +148,8 @@ class Shell:
         self._delivery.interests = Interests(config.limits, self.health_report.memory, self._delivery)
         self.health_report.chapters["interests"] = self._delivery.interests.rows
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._control, self.health_report.memory)
+        stats, at_router = self.health_report.read, bool(config.connect)
+        self._administration = Administration(self._service, self.maps, self._delivery, stats, at_router)
         self.health_report.chapters["protocol"] = known
         self.health_report.chapters["unopened"] = self.maps.unopened
         if library is not None:
@@ -270,7 +272,7 @@ class Shell:
 
     def _on_admin(self, query: Asker) -> None:
         if (waiting := self._control.waiting) < _ADMIN_WAITING:
-            self._control.hand(self._administer, query)
+            self._control.hand(self._administration.answer, query)
         else:
             refuse(query, Busy(waiting, 0.1))
 
@@ -335,42 +337,6 @@ class Shell:
             again(query)
         else:
             self._delivery.refusals.hand(self._refuse_missing, query, name, following)
-
-    def _administer(self, query: Asker) -> None:
-        operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)
-        try:
-            if operation in ("maps", "stats"):
-                self.maps.open_new()
-            if operation == "maps":
-                told = {"maps": self.maps.rows(), "service": self._service, "version": __version__, "protocol": known()}
-                self._delivery.answer(query, codec.encode_map(told))
-            elif operation == "stats":
-                self._delivery.answer(query, codec.encode_map(self.health_report.read()))
-            elif operation == "create":
-                self._delivery.answer(
-                    query, codec.encode_map(self.maps.create(*read_create(payload)) | {"protocol": known()})
-                )
-            elif operation == "fork":
-                self.maps.fork(query, read_fork(payload))
-            elif operation == "drop":
-                self.maps.drop(query, read_drop(payload))
-            elif operation == "budget":
-                self.maps.change_budget(query, read_budget(payload))
-            elif self._config.connect:
-                ignore(query)  # another service at the router may know it
-            else:
-                raise UnknownQuestion(f"admin/{operation}", "maps, stats, create, fork, drop or budget")
-        except NotHere as problem:
-            if self._config.connect:
-                ignore(query)  # for another service at the router
-            else:
-                self._delivery.refuse(query, problem)
-        except Problem as problem:
-            self._delivery.refuse(query, problem)
-        except Exception:
-            reference = secrets.token_hex(4)
-            log.exception("fault %s: admin/%s", reference, operation)
-            self._delivery.refuse(query, Internal(reference))
 
     def _look_for_workers(self) -> None:
         self._latencies.look_for(self._jobs.suspects, self._jobs.distrusted)
