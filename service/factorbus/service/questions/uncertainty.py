@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.proto import asking, asking_codec
-from factorbus.proto.arrays import I64
+from factorbus.proto.arrays import F64, I64
 from factorbus.proto.asking import Associated, CovarianceGroup, Covariances, Gained, Gated, Why
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Factors
@@ -27,7 +27,7 @@ from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.relative import relative
 from factorbus.solver.covariance.square_root import SquareRoot
 from factorbus.solver.covariance.why import why_factor, why_variable
-from factorbus.solver.errors import UnknownVariable
+from factorbus.solver.errors import NotFinite, UnknownVariable
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import variables_aside
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
@@ -40,6 +40,7 @@ _MOST = 100_000  # candidates, or pairs of observation and landmark, in one ques
 _MOST_FACTORS = 10_000  # of a variable that is asked about: some seconds
 _OF_AN_EXPLANATION = 100  # numbers that the explanation of a factor comes to, with its names, at most
 _SMALLEST = min(kind.dim for kind in VARIABLE_KINDS.values())
+_NAMED = 4  # keys in the text of an error
 _UNBOUNDED = Room()
 
 DECODE: Mapping[str, Callable[[bytes], Any]] = {
@@ -226,6 +227,7 @@ class Uncertain:
         for code in np.unique(codes).tolist():
             rows, kind = np.flatnonzero(codes == code), VARIABLE_KIND_OF_CODE[code]
             covariance = found[rows, : kind.dim, : kind.dim]
+            _check_finite(covariance, graph.keys[variables[rows]])
             groups.append(CovarianceGroup(kind.name, graph.keys[variables[rows]], covariance))
         return asking_codec.encode_covariances(Covariances(*self._when, blocks, tuple(groups)))
 
@@ -236,6 +238,7 @@ class Uncertain:
         dims, other_dims = self._blocks.factored.dims[rows], self._blocks.factored.dims[columns]
         self._afford(costs.of_matrix(self._blocks, rows, columns), taken)
         covariance = self._blocks.between(rows, columns)
+        _check_finite(covariance[None], keys[None])
         if blocks == "joint":
             return asking_codec.encode_covariances(
                 Covariances(*self._when, blocks, (), keys, dims, covariance=covariance)
@@ -264,6 +267,16 @@ class Uncertain:
     def _landmarks(self, kind: str) -> I64:
         code = VARIABLE_KINDS[FACTOR_KINDS[kind].connects[1]].code
         return np.flatnonzero(self._graph.var[: self._blocks.factored.count, at.V_KIND] == code)
+
+
+def _check_finite(covariances: F64, keys: I64) -> None:
+    """Raises NotFinite for the first of `covariances` (n, d, d) that is not, which is of the key, or the keys, keys[n].
+
+    R of a map whose information goes over more than double precision has may have pivots that are next to nothing.
+    """
+    bad = np.flatnonzero(~np.isfinite(covariances).all(axis=(1, 2)))
+    if bad.size:
+        raise NotFinite(f"the covariance of {', '.join(map(format_symbol, np.ravel(keys[bad[0]])[:_NAMED].tolist()))}")
 
 
 def check_keys(ask: Any, room: Room) -> None:
