@@ -37,7 +37,7 @@ def natural(text: str) -> int:
 
 
 def file_named(text: str) -> str:
-    """A file to write, or "-": what is measured takes hours, so a path that cannot be is told before."""
+    """A file to write, or "-".  Measuring takes hours, so a path that cannot be written is refused before."""
     path = Path(text)
     if text != "-" and (path.is_dir() or not path.absolute().parent.is_dir()):
         raise argparse.ArgumentTypeError(f"{text!r}; wanted a file in a folder that is there")
