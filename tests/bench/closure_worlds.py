@@ -11,7 +11,8 @@ from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors
 from factorbus.solver import Options, Solver
 
-WORLDS = ("streets", "intel", "sphere")
+WORLDS = ("streets", "intel", "sphere", "city")
+_FILES = {"intel": "intel", "sphere": "sphere2500", "city": "city10000"}
 SLACK_M = {"intel": 0.01}  # what is added to errors where the optimum is the truth, which the last step comes to
 
 
@@ -45,14 +46,15 @@ def _estimated(solver: Any) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _public(name: str) -> tuple[list[Batch], np.ndarray]:
-    """A data set pose by pose, and its true poses: of the sphere the ground truth, of intel the optimum."""
-    path = find({"intel": "intel", "sphere": "sphere2500"}[name])
+    """A data set pose by pose, and its true poses: the ground truth, of intel the optimum."""
+    path = find(_FILES[name])
     if path is None:
         raise FileNotFoundError(f"data set {name} is not on this machine: factorbus datasets fetch {name}")
     batches = list(read(path).steps())
     if name == "sphere":
         batches = [batch._replace(factors=tuple(_squared(group) for group in batch.factors)) for batch in batches]
-        return batches, np.loadtxt(path.parent / "groundtruth" / "sphere2500_groundtruth.txt")[:, 1:]
+    if name != "intel":
+        return batches, np.loadtxt(path.parent / "groundtruth" / f"{_FILES[name]}_groundtruth.txt")[:, 1:]
     solver = Solver(Options())
     for batch in batches:
         solver.stage(batch)

@@ -1,13 +1,14 @@
 """False loop closures, online: how many are believed, how many right ones are not, and what that does to the estimate.
 
     factorbus bench closures [--draws N] [--seed S] [--only none,random,local,grouped] [--shares 0.1,0.3,0.5]
-                             [--worlds streets,intel,sphere] [--poses N] [--rivals RIVAL,...] [--json]
+                             [--worlds streets,intel,sphere,city] [--poses N] [--rivals RIVAL,...] [--json]
 
 Each draw is a drive through streets drawn anew, pose by pose, or the first poses of a public data set with false
 closures drawn anew, whose own closures count as right; seeds are printed.  Kinds of false closures are in
 `false_closures`.  `test` is `GatedSolver`.  Rivals are the same solver with what comes: `trust` believes everything;
 `huber`, `cauchy` and `dcs` have a loss of one standard deviation on every closure.  `isam2-dcs` and
-`isam2-geman-mcclure` are GTSAM's iSAM2 with its own such losses.  Of each:
+`isam2-geman-mcclure` are GTSAM's iSAM2 with its own such losses; `gnc` is its `GncOptimizer`, a batch at every
+hundredth step, of maps in the plane.  These are left out where GTSAM is not installed.  Of each:
 
     precision, recall   of the closures that are in at the end, how many are right; of the right ones, how many are in;
                         a loss has all of them in, in part
@@ -16,10 +17,11 @@ closures drawn anew, whose own closures count as right; seeds are printed.  Kind
                 centimetre is added to both errors
     clean   draws whose estimate ends within 1.05 of that
     delay_steps   until a right one was in;  left: draws in which a false one was in at the end
-    cpu_ratio   processor time against `trust` without false ones; of iSAM2 `update` is timed
+    cpu_ratio   processor time against `trust` without false ones; of iSAM2 `update` is timed, of `gnc` `optimize`
 """
 
 import argparse
+import importlib.util
 import json
 import sys
 import time
@@ -40,7 +42,8 @@ from factorbus.solver import Options, Solver
 from factorbus.solver.closures.gated import GatedSolver
 
 LOSSES = ("huber", "cauchy", "dcs")
-RIVALS = ("trust", *LOSSES, "isam2-dcs", "isam2-geman-mcclure")
+OF_GTSAM = ("isam2-dcs", "isam2-geman-mcclure", "gnc")
+RIVALS = ("trust", *LOSSES, *OF_GTSAM)
 _EVERY = 100
 PRECISION, RECALL, GROUPED = 0.98, 0.98, 0.95  # the targets, and that of both with grouped ones
 
@@ -59,6 +62,9 @@ def main() -> int:
     told = parser.parse_args()
     first = int(np.random.default_rng().integers(2**31)) if told.seed is None else told.seed
     names = ["test", *(name for name in told.rivals.split(",") if name)]
+    if any(name in OF_GTSAM for name in names) and importlib.util.find_spec("gtsam") is None:
+        names = [name for name in names if name not in OF_GTSAM]
+        print("GTSAM is not installed: its rivals are left out", file=sys.stderr)
     seeds = range(first, first + told.draws)
     if not told.json:
         print(f"seeds {seeds.start}..{seeds.stop - 1}", flush=True)
@@ -95,8 +101,8 @@ def _is_met(row: dict[str, Any]) -> bool:
 def _drive(drive: DriveWithFalse, name: str) -> dict[str, Any]:
     """One drive with one solver."""
     gated = GatedSolver(Options()) if name == "test" else None
-    solver = _isam2() if name.startswith("isam2-") else Solver(Options())
-    losses = "" if name in ("test", "trust") else name.removeprefix("isam2-")
+    solver = _solver(name)
+    losses = "" if name in ("test", "trust", "gnc") else name.removeprefix("isam2-")
     errors, cpu = list[float](), 0.0
     for k, batch in enumerate(drive.batches, 1):
         given = _with_loss(batch, losses) if losses else batch
@@ -117,6 +123,8 @@ def _drive(drive: DriveWithFalse, name: str) -> dict[str, Any]:
     false = drive.is_false()
     closures = gated.closures if gated else []
     is_in = np.array([c.is_in for c in closures], bool) if gated else np.ones(false.size, bool)
+    if name == "gnc" and not isinstance(solver, Solver):
+        is_in = solver.believed()
     right = ~false
     delays = np.array([c.changed - c.came for c in closures if c.is_in])[right[is_in]] if gated else np.zeros(1)
     return {
@@ -125,8 +133,15 @@ def _drive(drive: DriveWithFalse, name: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _isam2() -> Any:
-    from replays.isam2 import Isam2, Isam2Settings  # who does not ask for it need not have GTSAM
+def _solver(name: str) -> Any:
+    """Who does not ask for one of GTSAM's need not have it."""
+    if name not in OF_GTSAM:
+        return Solver(Options())
+    if name == "gnc":
+        from replays.gnc import Gnc
+
+        return Gnc(_EVERY)
+    from replays.isam2 import Isam2, Isam2Settings
 
     return Isam2(Isam2Settings(0.1))
 
