@@ -25,7 +25,16 @@ from factorbus.solver.closures.ledger import ACCEPTED, SUSPECT, Closure, Closure
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.closures.switching import without_factors
-from factorbus.solver.kernels.closures.ahead import END_ITSELF, J_ALLOWED, J_BOUND, J_MEASURED, J_NOISE
+from factorbus.solver.kernels.closures.ahead import (
+    END_ITSELF,
+    J_ALLOWED,
+    J_BOUND,
+    J_MEASURED,
+    J_NOISE,
+    J_ODDS,
+    J_SIZE,
+    believe_ahead,
+)
 from factorbus.solver.kernels.model import layout as at
 
 _SPREAD = FalseSpread(5.0, 0.5)
@@ -75,11 +84,13 @@ def test_before_the_step_a_closure_is_judged_as_after_it(new: int, partner: int)
         there = there @ pose_matrix(factor.measured[0])
     closing = between(partner, keys[-1], (pose_vector(there) + np.array([0.02, -0.03, 0.01])).tolist())
     batch = Batch((Variables("se2", np.array(keys)),), (*odometry, closing))
-    split, mark = forest.split(batch), solver._graph.mark()
+    split, before = forest.split(batch), solver._graph.counts.copy()
     first = solver.stage(batch)
-    foreseen = ahead._foresee(solver, split, np.array([first + new]), mark, volume_of(_SPREAD))
+    limits = np.array([16.0, 30.0, 1.0, volume_of(_SPREAD)])
+    foreseen = ahead._foresee(solver, split, np.array([first + new]), before, limits)
     assert foreseen is not None
-    solver._graph.forget(mark)
+    assert foreseen.believed == 1
+    solver._graph.forget(tuple(before.tolist()))
     solver.stage(batch._replace(factors=tuple(split.trusted)))
     solver.step()
     ledgers = ClosureLedger()
@@ -90,8 +101,10 @@ def test_before_the_step_a_closure_is_judged_as_after_it(new: int, partner: int)
     np.testing.assert_allclose(judged[J_ALLOWED:J_NOISE], after.allowed[0], rtol=5e-3, atol=1e-5)
     np.testing.assert_allclose(judged[J_NOISE : J_NOISE + 3], numbers.noise[0], rtol=1e-9)
     np.testing.assert_allclose(judged[J_MEASURED:], numbers.z[0], rtol=1e-12)
-    assert foreseen.distance[0] == pytest.approx(after.distance[0], rel=1e-2)
-    assert foreseen.chance[0] == pytest.approx(after.chance[0, 0], rel=5e-2)
+    distance, chance, believed = foreseen.odds[0].tolist()
+    assert distance == pytest.approx(after.distance[0], rel=1e-2)
+    assert chance == pytest.approx(after.chance[0, 0], rel=5e-2)
+    assert believed == 1.0
     ends = solver._graph.var[foreseen.ends[:, END_ITSELF], at.V_AT] // 3
     assert ends.tolist() == [partner, keys[-1]]
     # When it is in, what it was judged by says what the map is without it.
@@ -115,11 +128,11 @@ def test_what_more_than_odometry_holds_is_judged_after_a_step(further: Factors) 
     batch = Batch(tuple(new), (between(11, 12, [1.0, 0.0, 0.6283]), further, between(2, 12, [0.0, 0.0, 0.0])))
     split = made._joined.split(batch)
     made._joined.forget()
-    mark = made.solver._graph.mark()
+    before = made.solver._graph.counts.copy()
     first = made.solver.stage(batch)
     rows = np.array([first + 2])
-    assert (ahead._foresee(made.solver, split, rows, mark, 1.0) is None) != more
-    made.solver._graph.forget(mark)
+    assert (ahead._foresee(made.solver, split, rows, before, np.ones(4)) is None) != more
+    made.solver._graph.forget(tuple(before.tolist()))
     report = made.insert(batch)
     assert [c.keys for c in report.accepted] == [(2, 12)]
     assert made.solver.factor_count == 15
@@ -220,3 +233,24 @@ def test_a_motion_without_closures_is_moved_in_space_too() -> None:
     found = numbers_without(numbers, 1)
     np.testing.assert_allclose(found.b[0], motions_of_poses(np.array([turned]))[0], atol=0.02)
     assert np.abs(found.b[0] - numbers.b[1]).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("told", "believed"),
+    [
+        ([(1.0, 0.01), (16.0, 1e-9)], [1.0, 1.0]),
+        ([(1.0, 0.01), (31.0, 1e-9)], [1.0, 0.0]),  # beyond what any agreement allows: it says nothing of the other
+        ([(1.0, 0.01), (17.0, 1e-9)], [0.0, 0.0]),  # outside the gate, and may be right
+        ([(1.0, 0.01), (1.0, 0.3)], [0.0, 0.0]),  # within it, and may be false
+        ([(1.0, 1e9), (400.0, 1e9)], [0.0, 0.0]),  # odds are even at most
+    ],
+)
+def test_none_goes_in_before_the_step_where_one_may_speak_against_the_others(
+    told: list[tuple[float, float]], believed: list[float]
+) -> None:
+    judged = np.zeros((2, J_SIZE, 3))
+    judged[:, J_ODDS, :2] = told
+    judged[:, J_ODDS, 1] *= 50.0
+    assert believe_ahead(np.array([16.5, 30.0, 0.02, 50.0]), judged) == sum(believed)
+    assert judged[:, J_ODDS, 2].tolist() == believed
+    np.testing.assert_allclose(judged[:, J_ODDS, 1], np.minimum([p for _, p in told], 1.0))

@@ -145,3 +145,43 @@ def test_a_look_is_due_at_every_eighth_and_while_any_is_a_suspect() -> None:
     assert made.suspects()
     for made.ledger.looks in range(1000, 1016):
         assert not made.judge.is_settled(made.ledger)
+
+
+def test_one_suspect_outside_the_gate_is_not_looked_at_again_while_it_is_alone() -> None:
+    made = driven(300)
+    first = int(made.solver._graph.keys[0])
+    weight = np.array([[400.0, 0.0, 0.0, 400.0, 0.0, 900.0]])
+    off = Factors(_PLANE, np.array([[first, first + 299]]), np.array([[900.0, 0.0, 0.0]]), weight)
+    made.insert(Batch((), (off,)))
+    (alone,) = made.suspects()
+    assert alone.reason == "improbable"
+    ledger, seen = made.ledger.of_kind[_PLANE], alone.distance
+    ledger.looked[alone.row], made.ledger.looks = 0, made.ledger.moved_at  # as after a look at which others went in
+    row, limits = np.array([alone.row]), made.judge.limits[3]
+    between = 0.5 * (limits.gate + limits.out)  # what agrees with others may be there
+    ledger.bound[row] *= between / residuals_weighed(made.solver, ledger, row).item()
+    assert made.judge.look(made.solver, made.ledger, _PLANE) is None
+    ledger.bound[row] *= 0.9 * limits.gate / between
+    verdicts = made.judge.look(made.solver, made.ledger, _PLANE)
+    assert verdicts is not None
+    assert verdicts.factors.tolist() == [alone.factor_id]
+    assert (verdicts.reasons, verdicts.distance[0]) == (("improbable",), pytest.approx(seen, rel=1e-3))
+
+
+@pytest.mark.parametrize(("off_m", "counted"), [(4.0, True), (40.0, False)])
+def test_improbable_ones_that_are_far_off_do_not_make_near_ones_likelier(off_m: float, counted: bool) -> None:
+    made = driven(300)
+    graph, ledger = made.solver._graph, made.ledger.of_kind[_PLANE]
+    first, before = int(graph.keys[0]), made.judge._odds(made.solver, ledger)
+    estimate = {int(k): v for g in made.solver.estimate() for k, v in zip(g.keys, g.values, strict=True)}
+    (dx, dy), turn = estimate[first + 299][:2] - estimate[first][:2], estimate[first][2]
+    there = [np.cos(turn) * dx + np.sin(turn) * dy, np.cos(turn) * dy - np.sin(turn) * dx]
+    z = [there[0] + off_m, there[1], estimate[first + 299][2] - turn]
+    weight = np.array([[400.0, 0.0, 0.0, 400.0, 0.0, 900.0]])
+    made.insert(Batch((), (Factors(_PLANE, np.array([[first, first + 299]]), np.array([z]), weight),)))
+    assert [c.reason for c in made.suspects()] == ["improbable"]
+    odds = made.judge._odds(made.solver, ledger)
+    assert odds.false == pytest.approx(before.false * (2.0 if counted else 1.0))
+    made.suspects()[0].reason = "rival"
+    ledger.mark(made.closures[-1])
+    assert made.judge._odds(made.solver, ledger).false == pytest.approx(2.0 * before.false)

@@ -14,7 +14,6 @@ from factorbus.solver.closures.choosing import PASSED
 from factorbus.solver.closures.judging import ClosureJudge
 from factorbus.solver.closures.ledger import ACCEPTED, NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.closures.loops import SplitFactors
-from factorbus.solver.graph.factor_graph import Mark
 from factorbus.solver.graph.groups import Addition, BatchLike
 from factorbus.solver.kernels.closures import ahead
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -25,12 +24,19 @@ _PLANE = "between_se2"
 
 
 class Foreseen(NamedTuple):
-    """What the map expects of some closures: their judgements as `judge_ahead` has them, and d² and odds of each."""
+    """What the map expects of some closures, as `foresee_closures` has it.
+
+    numbers: their judgements.  ends: of both.  believed: how many go in with the step.
+    """
 
     numbers: F64
-    ends: I64  # as `list_closure_ends` has them
-    distance: list[float]
-    chance: list[float]
+    ends: I64
+    believed: int
+
+    @property
+    def odds(self) -> F64:
+        """(n, 3): d², the odds of the residual, and whether it is believed, of each."""
+        return self.numbers[:, ahead.J_ODDS]
 
 
 class StagedBatch(NamedTuple):
@@ -54,7 +60,7 @@ class StagedBatch(NamedTuple):
         if self.given is not None or self.foreseen is None:
             return self.given or NO_VERDICTS
         which = np.flatnonzero(self.believed)
-        distance, chance = np.array(self.foreseen.distance)[which], np.array(self.foreseen.chance)[which]
+        distance, chance, _ = self.foreseen.odds[which].T.copy()
         states, reasons = (ACCEPTED,) * which.size, (PASSED,) * which.size
         ids = self.first + self.split.closing_at[which]
         return ClosureVerdicts(ids, states, reasons, distance, chance, np.full(which.size, -1))
@@ -69,25 +75,21 @@ def stage_with_believed(
     given: verdicts on those that are, of a batch that was judged before.
     """
     graph = solver._graph
-    before = graph.mark()
-    first = solver.stage(batch)
-    row, foreseen = before[at.FACTORS], None
+    before = graph.counts.copy()
+    first, row, foreseen = solver.stage(batch), before.item(at.FACTORS), None
     if given is None:
-        rows = graph.rows_of(first + split.closing_at) if graph.counts.item(at.MEMBERS) else row + split.closing_at
-        foreseen = _foresee(solver, split, rows, before, judge.volume)
+        closing_at = split.closing_at
+        rows = graph.rows_of(first + closing_at) if graph.counts.item(at.MEMBERS) else row + closing_at
+        foreseen = _foresee(solver, split, rows, before, judge.limits_ahead(solver, ledgers.of_kind[_PLANE]))
+        if foreseen is not None and foreseen.believed == rows.size:
+            return StagedBatch(split, first, row, [True] * rows.size, foreseen, None, True)
     if foreseen is None:
         believed = np.isin(first + split.closing_at, () if given is None else given.factors).tolist()
     else:
-        gate, out, _ = judge.limits[3]
-        most = judge.policy.closure_chance_max / ledgers.of_kind[_PLANE].odds().false
-        believed = [d2 <= gate and p <= most for d2, p in zip(foreseen.distance, foreseen.chance, strict=True)]
-        if not all(believed) and any(
-            d2 <= out and not is_in for d2, is_in in zip(foreseen.distance, believed, strict=True)
-        ):
-            believed = [False] * len(believed)  # it may speak against the others: they are judged together
+        believed = (foreseen.odds[:, ahead.J_BELIEVED] > 0.0).tolist()
     staged = StagedBatch(split, first, row, believed, foreseen, given, all(believed))
     if not staged.all_in:
-        graph.forget(before)
+        graph.forget(tuple(before.tolist()))
         restage(solver, batch, staged)
     return staged
 
@@ -109,7 +111,7 @@ def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, 
         rows = np.arange(staged.row, graph.counts.item(at.FACTORS))
         graph.rename_last(first + places[graph.ids_of(rows) - first], first + split.count)
     if seen is None:
-        placed = zip(split.closing, split.closing_at.tolist(), strict=True)
+        placed = zip(split.closing, split.places, strict=True)
         added = [ledgers.add(factor, first + place, graph, revision) for factor, place in placed]
         if is_in.any():
             ledgers.note(staged.verdicts(), revision)
@@ -117,10 +119,10 @@ def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, 
     bounds = seen.numbers[:, ahead.J_BOUND : ahead.J_MEASURED]
     if not is_in.all():
         bounds[~is_in] = np.linalg.inv(seen.numbers[~is_in, ahead.J_ALLOWED : ahead.J_NOISE])
-    made = list[Closure]()
-    for k, place in enumerate(split.closing_at.tolist()):
+    made, odds = list[Closure](), seen.odds.tolist()
+    for k, place in enumerate(split.places):
         if staged.believed[k]:
-            told = ACCEPTED, PASSED, seen.distance[k], seen.chance[k], revision
+            told = ACCEPTED, PASSED, odds[k][ahead.J_DISTANCE], odds[k][ahead.J_CHANCE], revision
             made.append(Closure(first + place, 0, split.closing[k], revision, *told))
         else:
             made.append(Closure(first + place, 0, split.closing[k], revision, changed=revision))
@@ -133,28 +135,27 @@ def _enter_expected(
     ledgers: ClosureLedger, split: SplitFactors, first: int, seen: Foreseen, revision: int
 ) -> list[Closure]:
     """The same where all went in with the step, as the map expected."""
-    row, numbers = len(ledgers.of_kind[_PLANE].closures), seen.numbers
-    each = zip(split.closing, split.closing_at.tolist(), seen.distance, seen.chance, strict=True)
-    made = [
-        Closure(first + place, n, factor, revision, ACCEPTED, PASSED, d2, p, revision)
-        for n, (factor, place, d2, p) in enumerate(each, row)
-    ]
-    ledgers.enter_accepted(_PLANE, made, seen.ends, numbers)
+    made, n = list[Closure](), len(ledgers.of_kind[_PLANE].closures)
+    of_factor = ledgers.of_factor
+    for factor, place, (d2, p, _) in zip(split.closing, split.places, seen.odds.tolist(), strict=True):
+        closure = of_factor[first + place] = Closure(
+            first + place, n, factor, revision, ACCEPTED, PASSED, d2, p, revision
+        )
+        made.append(closure)
+        n += 1
+    ledgers.enter_accepted(_PLANE, made, seen.ends, seen.numbers)
     return made
 
 
-def _foresee(solver: Solver, split: SplitFactors, closing: I64, before: Mark, volume: float) -> Foreseen | None:
+def _foresee(solver: Solver, split: SplitFactors, closing: I64, before: I64, limits: F64) -> Foreseen | None:
     """What the map expects of closures in the rows `closing`, which are staged; None: it takes the step to say.
 
-    volume: where false ones are.
+    before: what was in use after the last step.  limits: as of `believe_ahead`.
     """
     for factor in split.closing:
         if factor.kind != _PLANE:
             return None
     n = closing.size
     ends, numbers = np.empty((2 * n, ahead.END_COLUMNS), np.int64), np.empty((n, ahead.J_SIZE, 3))
-    if not solver.covariances.try_foresee(before[at.VARIABLES], before[at.FACTORS], closing, ends, numbers):
-        return None
-    told = numbers[:, 0].tolist()
-    distance, chance = [one[0] for one in told], [min(one[1] / volume, 1.0) for one in told]
-    return Foreseen(numbers, ends, distance, chance)
+    believed = solver.covariances.try_foresee(before, closing, limits, ends, numbers)
+    return None if believed < 0 else Foreseen(numbers, ends, believed)

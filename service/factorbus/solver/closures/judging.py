@@ -23,6 +23,7 @@ from factorbus.solver.closures.choosing import (
     LEAST_RIVALS,
     PASSED,
     Chosen,
+    ClosureOdds,
     choose_closures,
     closure_places,
     limits_of,
@@ -49,9 +50,10 @@ from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, 
 from factorbus.solver.closures.policy import ClosurePolicy
 from factorbus.solver.closures.switching import without_factors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.kernels.looked_back import WORST
 from factorbus.solver.errors import SolverError
 from factorbus.solver.kernels.closures.ahead import list_companions, weigh_residuals
-from factorbus.solver.kernels.closures.back import bound_without, list_free_ends, list_worst
+from factorbus.solver.kernels.closures.back import count_near
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
@@ -60,7 +62,7 @@ CONTRADICTED = "contradicted"
 _NEWEST = 40  # suspects, or accepted ones, among which places are looked for
 _BELIEVED = {PASSED, AGREES}
 _PLANE_DIM, _SPACE_DIM = 3, 6
-_WORST = 4  # accepted ones whose d² is computed in a step
+_MOST_COUNTED = 256  # improbable ones
 _TOGETHER = 64  # new closures that are judged together: each two of them are compared
 _LOOK_BACK_EVERY = 8  # looks
 _RETRY = 2  # rivals that have to be new before the same closures are tried again
@@ -74,11 +76,17 @@ class ClosureJudge:
     def __init__(self, policy: ClosurePolicy | None = None) -> None:
         self.policy = policy or ClosurePolicy()
         self.limits = {dims: limits_of(self.policy, dims) for dims in (_PLANE_DIM, _SPACE_DIM)}
-        self.volume = volume_of(self.limits[_PLANE_DIM].spread)  # where false ones are
+        gate, out, spread = self.limits[_PLANE_DIM]
+        self._ahead = np.array([gate, out, 1.0, volume_of(spread)])
+
+    def limits_ahead(self, solver: Solver, ledger: Ledger) -> F64:
+        """As `believe_ahead` takes them, the same array each time."""
+        self._ahead[2] = self.policy.closure_chance_max / self._odds(solver, ledger).false
+        return self._ahead
 
     def is_settled(self, ledgers: ClosureLedger) -> bool:
         """Whether `looks` has nothing to say behind an insert whose closures all went in with its step."""
-        return not ledgers.has_suspects and ledgers.looks % _LOOK_BACK_EVERY > 0
+        return not ledgers.suspect_count and ledgers.looks % _LOOK_BACK_EVERY > 0
 
     def looks(
         self, solver: Callable[[], Solver], ledgers: ClosureLedger, new: Sequence[Closure]
@@ -99,7 +107,7 @@ class ClosureJudge:
         suspects that may be believed now; None: there are none.  Raises SolverError.
         """
         ledger = ledgers.of_kind[kind]
-        if not ledgers.has_suspects:
+        if not ledgers.suspect_count or self._is_alone_beyond(solver, ledgers, ledger):
             return None
         new = ledger.unjudged()[:_TOGETHER]
         if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: len(ledger.closures)].any():
@@ -117,6 +125,18 @@ class ClosureJudge:
             rows = [row for row in rows if row[0].factor_id not in again] + tried
         return verdicts_of(rows + alone)
 
+    def _is_alone_beyond(self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger) -> bool:
+        """Whether there is one suspect, which was looked at, and is outside the gate by its bound: it stays what it is.
+
+        One by itself is believed within the gate alone; what agrees with others may be beyond it.
+        """
+        if ledgers.suspect_count != 1 or not ledger.closures:
+            return False
+        row = int(ledger.is_suspect[: len(ledger.closures)].argmax())
+        if not ledger.is_improbable[row]:
+            return False
+        return residuals_weighed(solver, ledger, np.array([row])).item() > self.limits[ledger.dim].gate
+
     def look_back(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
         """The worst of those accepted, where it is improbable; None: none is.  Raises SolverError."""
         ledger = ledgers.of_kind[kind]
@@ -126,14 +146,9 @@ class ClosureJudge:
         if not tested.size:
             return None
         out = self.limits[ledger.dim].out
-        worst = _worst(solver, ledger, tested, out)
-        if not worst.size:
+        if (worst := _contradicted(solver, ledger, tested, out)) < 0:
             return None
-        _bound_anew(solver, ledger, worst)
-        d2 = residuals_weighed(solver, ledger, worst)
-        if float(d2.max()) <= out:
-            return None
-        row = worst[[int(d2.argmax())]]
+        row = np.array([worst])
         ledger.bound[row] = exact_weights_without(closure_numbers(solver, ledger, row))
         if (distance := residuals_weighed(solver, ledger, row).item()) <= out:
             return None
@@ -143,7 +158,22 @@ class ClosureJudge:
     def _chosen(self, solver: Solver, ledger: Ledger, rows: I64, all_together: bool = False) -> Chosen:
         """Among rows."""
         extent = self._extent(solver, ledger) if rows.size > 1 else 0.0  # which one by itself does not need
-        return choose_closures(closure_numbers(solver, ledger, rows), extent, self.policy, ledger.odds(), all_together)
+        return choose_closures(
+            closure_numbers(solver, ledger, rows), extent, self.policy, self._odds(solver, ledger), all_together
+        )
+
+    def _odds(self, solver: Solver, ledger: Ledger) -> ClosureOdds:
+        """Those before, by the ledger and by where the newest improbable ones are.
+
+        The odds of a residual are those of a false closure within the policy's spread: one that is farther off, and
+        with which no others agree, says nothing of how many of these there are.
+        """
+        if not ledger.improbable or ledger.dim != _PLANE_DIM:
+            return ledger.odds()
+        rows = np.flatnonzero(ledger.is_improbable[: len(ledger.closures)])[-_MOST_COUNTED:]
+        spread, table = self.limits[ledger.dim].spread, solver._graph.array_table
+        near = count_near(rows, ledger.ends, ledger.z, table, spread.metres, spread.radians)
+        return ledger.odds(near / rows.size)
 
     def _extent(self, solver: Solver, ledger: Ledger) -> float:
         """Half the length of the map: mistakes may lead to wherever it has poses."""
@@ -226,7 +256,9 @@ class ClosureJudge:
         stay += [(c, c.state, c.reason, c.distance, c.chance if several else odds, last) for c in on_trial]
         rows = np.concatenate([[c.row for c in on_trial], rivals])
         numbers = numbers_without(closure_numbers(solver, ledger, rows), len(on_trial))
-        if not _believes(choose_closures(numbers, self._extent(solver, ledger), self.policy, ledger.odds())):
+        if not _believes(
+            choose_closures(numbers, self._extent(solver, ledger), self.policy, self._odds(solver, ledger))
+        ):
             return stay  # by the linear model, which takes no step
         try:
             without = without_factors(solver, [c.factor_id for c in on_trial])
@@ -264,7 +296,7 @@ class ClosureJudge:
             return [], 1.0, []
         least = self.policy.closure_sets_max
         chance = np.array([ledger.closures[row].chance for row in untried.tolist()])
-        order = np.argsort(-chance, kind="stable")[: min(_WORST, np.count_nonzero(chance > least))]
+        order = np.argsort(-chance, kind="stable")[: min(WORST, np.count_nonzero(chance > least))]
         unsure = untried[order]
         if not unsure.size:
             return [], 1.0, []
@@ -301,27 +333,26 @@ def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:
     return np.einsum("na,nab,nb->n", r, ledger.bound[rows], r)
 
 
+def _contradicted(solver: Solver, ledger: Ledger, tested: I64, out: float) -> int:
+    """The row of the worst of those whose d² is beyond `out` by their bounds, which are made anew; −1: none is."""
+    if ledger.dim == _PLANE_DIM:
+        columns = ledger.z, ledger.noise, ledger.bound
+        if (found := solver.covariances.try_contradicted(tested, ledger.ends, columns, out)) is not None:
+            return found
+    worst = _worst(solver, ledger, tested, out)
+    if not worst.size:
+        return -1
+    ledger.bound[worst] = weights_without(closure_numbers(solver, ledger, worst))
+    d2 = residuals_weighed(solver, ledger, worst)
+    return int(worst[d2.argmax()]) if float(d2.max()) > out else -1
+
+
 def _worst(solver: Solver, ledger: Ledger, tested: I64, out: float) -> I64:
     """The worst first of those whose d² is beyond `out` by their bounds."""
-    if ledger.dim == _PLANE_DIM:
-        found, distance, table = np.empty(_WORST, np.int64), np.empty(_WORST), solver._graph.array_table
-        return found[: list_worst(tested, ledger.ends, ledger.z, ledger.bound, table, out, found, distance)]
     most_likely = residuals_weighed(solver, ledger, tested)
     worst = np.flatnonzero(~(most_likely <= out))
     order = np.argsort(-np.nan_to_num(most_likely[worst], nan=np.inf), kind="stable")
-    return tested[worst[order[:_WORST]]]
-
-
-def _bound_anew(solver: Solver, ledger: Ledger, rows: I64) -> None:
-    """The bounds of some closures that are in, by what the map is without each now."""
-    if ledger.dim == _PLANE_DIM:
-        table = solver._graph.array_table
-        free, places = np.empty(2 * rows.size, np.int64), np.empty((rows.size, 2), np.int64)
-        count = list_free_ends(rows, ledger.ends, table, free, places)
-        if (known := solver.covariances.try_joint(free[:count], _PLANE_DIM * count)) is not None:
-            bound_without(rows, ledger.ends, ledger.noise, places, known, table, ledger.bound)
-            return
-    ledger.bound[rows] = weights_without(closure_numbers(solver, ledger, rows))
+    return tested[worst[order[:WORST]]]
 
 
 def closure_numbers(solver: Solver, ledger: Ledger, rows: I64, with_covariance: bool = True) -> ClosureNumbers:

@@ -181,13 +181,15 @@ class Ledger:
         self.is_rival[row] = is_rival
         self.is_new[row] = is_suspect and closure.reason == NEW
 
-    def odds(self) -> ClosureOdds:
+    def odds(self, share: float = 1.0) -> ClosureOdds:
         """By those that have come (Laplace's rule), and even at most.
 
         Improbable ones count as false, those that are in as right; as mistakes that bring several at one place, rivals.
+        share: of the improbable ones without rivals, how many count.
         """
-        false, mistaken = (1 + self.improbable) / (1 + self.accepted), (_BURST + self.rivals) / (_BURST + self.accepted)
-        return ClosureOdds(min(false, 1.0), min(mistaken, 1.0))
+        alone = self.improbable - self.rivals
+        false, mistaken = 1 + self.rivals + share * alone, _BURST + self.rivals
+        return ClosureOdds(min(false / (1 + self.accepted), 1.0), min(mistaken / (_BURST + self.accepted), 1.0))
 
     def suspects(self) -> I64:
         """Rows."""
@@ -242,18 +244,18 @@ class ClosureLedger:
             self._counts[closure.state] += 1
 
     def enter_accepted(self, kind: str, new: Sequence[Closure], ends: I64, numbers: F64) -> None:
-        """The same of several that are all accepted, in rows which they know; numbers: of `judge_ahead`."""
+        """The same of several that are all accepted, in rows which they know, and are in `of_factor`; numbers: of
+        `judge_ahead`.
+        """
         self.looks += 1
         self.moved_at = self.looks
         self.of_kind[kind].enter_accepted(new, ends, self.looks, numbers)
-        for closure in new:
-            self.of_factor[closure.factor_id] = closure
         self._counts[ACCEPTED] += len(new)
 
     @property
-    def has_suspects(self) -> bool:
-        """Whether any is one."""
-        return self._counts[SUSPECT] > 0
+    def suspect_count(self) -> int:
+        """How many are suspects."""
+        return self._counts[SUSPECT]
 
     def named(self, factors: Iterable[int]) -> list[Closure]:
         """Those with these ids.  Raises NotAClosure."""

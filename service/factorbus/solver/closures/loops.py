@@ -18,7 +18,6 @@ from factorbus.solver.kernels.model import layout as at
 
 _GROUND = object()
 _FEW_ROWS = 16  # a group with no more is copied whole: it is kept for as long as a closure in it
-_NOWHERE: I64 = np.empty(0, np.int64)
 
 
 class RowOfFactors(NamedTuple):
@@ -61,18 +60,23 @@ class RowOfFactors(NamedTuple):
 class SplitFactors(NamedTuple):
     """The factors of a batch, how many there are, and those of them that close loops, one each.
 
-    closing_at: their places among all factors of the batch, ascending.
+    places: theirs among all factors of the batch, ascending.
     """
 
     factors: Sequence[FactorsLike]
     count: int
     closing: list[FactorsLike]
-    closing_at: I64
+    places: list[int]
+
+    @property
+    def closing_at(self) -> I64:
+        """The places as an array."""
+        return np.array(self.places, np.int64)
 
     @property
     def trusted_at(self) -> I64:
         """The places of those that are trusted."""
-        return np.delete(np.arange(self.count), self.closing_at)
+        return np.delete(np.arange(self.count), self.places)
 
     @property
     def trusted(self) -> list[FactorsLike]:
@@ -81,13 +85,16 @@ class SplitFactors(NamedTuple):
             return list(self.factors)
         trusted, before = list[FactorsLike](), 0
         is_trusted = np.ones(self.count, bool)
-        is_trusted[self.closing_at] = False
+        is_trusted[self.places] = False
         for group in self.factors:
             own = is_trusted[before : before + len(group.keys)]
             if own.any():
                 trusted.append(group if own.all() else pick_rows(group, own))
             before += len(group.keys)
         return trusted
+
+
+NOTHING_CLOSES = SplitFactors((), 0, [], [])
 
 
 def has_candidates(batch: BatchLike) -> bool:
@@ -100,49 +107,65 @@ class TrustedForest:
 
     def __init__(self) -> None:
         self._above: dict[object, object] = {}
-        self._sizes: dict[object, int] = {}
+        self._sizes: dict[object, int] = {}  # of roots; one that is not here has 1
         self._linked: list[tuple[object, object]] = []  # by the last batch
+        self._newest: tuple[object, object] = (None, None)  # the end of a chain, and its root; of none after a merger
 
     def split(self, batch: BatchLike) -> SplitFactors:
-        """Join what trusted factors of a batch join; gives them, and those that close loops."""
-        above, sizes, linked = self._above, self._sizes, self._linked
-        self._begin(batch)
+        """Join what trusted factors of a batch join; gives them, and those that close loops.
+
+        Where none does, as in most batches, `NOTHING_CLOSES`, which does not say what is trusted: all is.
+        """
+        above, sizes, linked, (newest, root) = self._above, self._sizes, self._linked, self._newest
+        linked.clear()
+        for group in batch.variables:
+            if group.fixed:
+                self._ground(group.keys)
+                newest, root = self._newest
         waiting: list[tuple[FactorsLike, int, int, int, int]] = []  # an alias that is called takes a microsecond
         count = 0
         for group in batch.factors:
             rows = group.keys.tolist()
             if group.kind not in POSES_BETWEEN or getattr(group, "trusted", False):
                 self._join_rows(rows)
+                newest, root = self._newest
                 count += len(rows)
                 continue
             for k, (i, j) in enumerate(rows):
                 if i - j != -1 and i - j != 1:
                     waiting.append((group, k, count + k, i, j))
-                elif j not in above and (root := above.get(i)) is not None and above[root] == root:
+                elif i == newest and j not in above:
                     # The next pose of what hangs together, as nearly every one is: what `_join` would do.
-                    above[j], sizes[j] = root, 1
+                    above[j] = root
                     sizes[root] += 1
                     linked.append((j, root))
+                    newest = j
                 else:
                     self._join(i, j)
+                    newest, root = self._newest = (j, self._root(j))
             count += len(rows)
+        self._newest = (newest, root)
         if not waiting:
-            return SplitFactors(batch.factors, count, [], _NOWHERE)
+            return NOTHING_CLOSES
         closing: list[FactorsLike] = []
-        closing_at: list[int] = []
+        places: list[int] = []
         of = kept = None
         for group, k, place, i, j in waiting:
-            if self._join(i, j):
+            beside = above.get(i)
+            if (beside is None or beside != above.get(j)) and self._join(i, j):
                 continue
-            closing_at.append(place)
+            places.append(place)
             if group is not of:
                 of, kept = group, _copied(group) if len(group.keys) <= _FEW_ROWS else None
             closing.append(RowOfFactors(kept, k) if kept else pick_row(group, k))
-        return SplitFactors(batch.factors, count, closing, np.array(closing_at) if closing else _NOWHERE)
+        return SplitFactors(batch.factors, count, closing, places)
 
     def join(self, batch: BatchLike) -> None:
         """Join what all factors of a batch join."""
-        self._begin(batch)
+        self._linked.clear()
+        for group in batch.variables:
+            if group.fixed:
+                self._ground(group.keys)
         for group in batch.factors:
             self._join_rows(group.keys.tolist())
 
@@ -150,8 +173,9 @@ class TrustedForest:
         """As before the last batch, which was refused."""
         for under, over in reversed(self._linked):
             self._above[under] = under
-            self._sizes[over] -= self._sizes[under]
+            self._sizes[over] -= self._sizes.setdefault(under, 1)
         self._linked.clear()
+        self._newest = (None, None)
 
     def renew(self, graph: FactorGraph) -> None:
         """What hangs together by all factors of a graph, from which some may have gone."""
@@ -187,12 +211,9 @@ class TrustedForest:
             self._join(heads.setdefault(part, key), key)
         self._linked.clear()
 
-    def _begin(self, batch: BatchLike) -> None:
-        self._linked.clear()
-        for group in batch.variables:
-            if group.fixed:
-                for key in group.keys.tolist():
-                    self._join(_GROUND, key)
+    def _ground(self, keys: I64) -> None:
+        for key in keys.tolist():
+            self._join(_GROUND, key)
 
     def _join_rows(self, rows: Sequence[Sequence[int]]) -> None:
         for row in rows:
@@ -203,7 +224,7 @@ class TrustedForest:
         """Join two, the smaller under the larger; False: they are."""
         first = self._root(one)
         if other not in self._above:  # the next pose, as a rule
-            self._above[other], self._sizes[other] = first, 1
+            self._above[other] = first
             self._sizes[first] += 1
             self._linked.append((other, first))
             return True
@@ -215,6 +236,7 @@ class TrustedForest:
         self._above[second] = first
         self._sizes[first] += self._sizes[second]
         self._linked.append((second, first))
+        self._newest = (None, None)
         return True
 
     def _root(self, of: object) -> object:

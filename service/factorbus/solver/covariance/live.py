@@ -4,6 +4,7 @@ import numpy as np
 
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.kernels.foreseen import foresee_closures
+from factorbus.solver.covariance.kernels.looked_back import find_contradicted
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.square_root import DIMS
 from factorbus.solver.graph.factor_graph import FactorGraph
@@ -17,10 +18,16 @@ class Live:
     def __init__(self, graph: FactorGraph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
 
-    def foresee(self, v0: int, f0: int, closing: I64, ends: I64, out: F64) -> int:
+    def foresee(self, before: I64, closing: I64, limits: F64, ends: I64, out: F64) -> int:
         """See `foresee_closures`."""
+        return foresee_closures(
+            before, closing, self._graph.array_table, self._tree.array_table, DIMS, limits, ends, out
+        )
+
+    def contradicted(self, rows: I64, ends: I64, columns: tuple[F64, F64, F64], most: float) -> int:
+        """See `find_contradicted`."""
         tables = self._graph.array_table, self._tree.array_table
-        return foresee_closures(v0, f0, closing, *tables, DIMS, ends, out)
+        return find_contradicted(rows, ends, columns, *tables, DIMS, most)
 
     def joint(self, variables: I64, scalars: int | None = None) -> F64:
         """(d, d): of different free variables together, in their order; scalars: d, where that is known."""

@@ -50,12 +50,17 @@ class CovarianceSource:
         """What keeps all diagonal blocks of the covariance up, updated after every step.  None: as for `try_view`."""
         return Upkeep(self._graph, self._tree) if self._tree else None
 
-    def try_foresee(self, v0: int, f0: int, closing: I64, ends: I64, out: F64) -> bool:
-        """Judge loop closures before their step, as `kernels.closures.ahead` does; False: that cannot be done.
+    def try_foresee(self, before: I64, closing: I64, limits: F64, ends: I64, out: F64) -> int:
+        """Judge loop closures before their step, as `kernels.closures.ahead` does; gives how many are believed, below
+        0: that cannot be done.
 
-        v0, f0: variables and factors that the last step had.  closing: rows of factors.  ends, out: what is found.
+        before: what was in use after the last step.  closing: rows of factors.  ends, out: what is found.
         """
-        return self._live is not None and self._live.foresee(v0, f0, closing, ends, out) >= 0
+        return -1 if self._live is None else self._live.foresee(before, closing, limits, ends, out)
+
+    def try_contradicted(self, rows: I64, ends: I64, columns: tuple[F64, F64, F64], most: float) -> int | None:
+        """The loop closure that the map contradicts most, as `find_contradicted` says it.  None: as for `try_view`."""
+        return self._live.contradicted(rows, ends, columns, most) if self._live else None
 
     def try_joint(self, variables: I64, scalars: int | None = None) -> F64 | None:
         """The joint covariance of a few different free variables (by index) as of the last step, read from R in place.

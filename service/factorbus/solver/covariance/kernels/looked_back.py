@@ -13,9 +13,7 @@ from factorbus.solver.kernels.model.records import graph_at
 WORST = 4  # of them the covariance is computed at one look
 
 
-@kernel(
-    "int64(int64[::1], int64[:,::1], UniTuple(float64[:,:,::1], 3), int64[::1], int64[::1], int64[::1], float64)"
-)
+@kernel("int64(int64[::1], int64[:,::1], UniTuple(float64[:,:,::1], 3), int64[::1], int64[::1], int64[::1], float64)")
 def find_contradicted(
     rows: I64, ends: I64, columns: tuple[F64, F64, F64], graph_table: I64, tree_table: I64, sizes: I64, most: float
 ) -> int:

@@ -29,7 +29,8 @@ from factorbus.solver.kernels.model.records import graph_at
 MOVED = 13  # numbers of an end: T as x, y, cosine, sine, and Q
 # Columns of `ends`: u, and where it is among the free ones, −1 where it is fixed; and the end itself.
 END_BASE, END_PLACE, END_ITSELF, END_COLUMNS = range(4)
-J_DISTANCE, J_ALLOWED, J_NOISE, J_WEIGHT, J_BOUND, J_MEASURED, J_SIZE = 0, 1, 4, 7, 10, 13, 16  # rows of a judgement
+J_ODDS, J_ALLOWED, J_NOISE, J_WEIGHT, J_BOUND, J_MEASURED, J_SIZE = 0, 1, 4, 7, 10, 13, 16  # rows of a judgement
+J_DISTANCE, J_CHANCE, J_BELIEVED = range(3)  # of the first row
 
 
 @kernel("int64(int64, int64, int64[::1], int64[::1], int64[::1], int64[:,::1], float64[:,::1])")
@@ -157,6 +158,32 @@ def judge_ahead(closing: I64, graph_table: I64, ends: I64, moved: F64, known: F6
             for c in range(3):
                 own[J_BOUND + r, c] = 0.0
         add_predicted(own[J_WEIGHT : J_WEIGHT + 3], 0, 0, 0, 0, own[J_ALLOWED : J_ALLOWED + 3], own[J_BOUND:])
+
+
+@kernel("int64(float64[::1], float64[:,:,::1])")
+def believe_ahead(limits: F64, judged: F64) -> int:
+    """Which closures go in with the step of their batch; gives how many.
+
+    Where one that is not believed may be right none is: it may speak against the others, and all are judged together.
+
+    in   limits: d² of the gate, d² beyond which one is improbable whatever agrees, the most odds, and the volume where
+         false ones are
+         judged: `out` of `judge_ahead`
+    out  its first rows: v becomes the odds of the residual, and 1 or 0 follows: believed or not
+    """
+    gate, beyond, most, volume, count, is_open = limits[0], limits[1], limits[2], limits[3], 0, False
+    for k in range(len(judged)):
+        own = judged[k, J_ODDS]
+        own[J_CHANCE] = min(own[J_CHANCE] / volume, 1.0)
+        is_in = own[J_DISTANCE] <= gate and own[J_CHANCE] <= most
+        own[J_BELIEVED] = 1.0 if is_in else 0.0
+        count += is_in
+        is_open = is_open or (not is_in and own[J_DISTANCE] <= beyond)
+    if is_open:
+        for k in range(len(judged)):
+            judged[k, J_ODDS, J_BELIEVED] = 0.0
+        return 0
+    return count
 
 
 @kernel(

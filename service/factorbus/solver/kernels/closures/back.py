@@ -5,7 +5,13 @@ import math
 import numpy as np
 
 from factorbus.solver.kernels.closures.ahead import place_among, pose_of, residual_weighed
-from factorbus.solver.kernels.closures.plane import add_predicted, motion_to, put_adjoint, put_weight_without
+from factorbus.solver.kernels.closures.plane import (
+    add_predicted,
+    motion_at,
+    motion_to,
+    put_adjoint,
+    put_weight_without,
+)
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import graph_at
@@ -81,3 +87,15 @@ def bound_without(rows: I64, ends: I64, noise: F64, places: I64, known: F64, gra
             if row >= 0 and column >= 0:
                 add_predicted(J, 3 * (m // 2), 3 * row, 3 * (m % 2), 3 * column, known, P)
         put_weight_without(P, noise[n], L, K, B, bound[n])
+
+
+@kernel("int64(int64[::1], int64[:,::1], float64[:,:,::1], int64[::1], float64, float64)")
+def count_near(rows: I64, ends: I64, z: F64, graph_table: I64, metres: float, radians: float) -> int:
+    """How many of some closures are off by this at most, along each axis and about it, at the estimate."""
+    graph = graph_at(graph_table)
+    var, values, count = graph.var, graph.values, 0
+    for n in rows:
+        a, b = pose_of(values, var[ends[n, 0], at.V_AT]), pose_of(values, var[ends[n, 1], at.V_AT])
+        x, y, c, s = motion_to(motion_at(z[n]), motion_to(a, b))
+        count += abs(x) <= metres and abs(y) <= metres and abs(math.atan2(s, c)) <= radians
+    return count
