@@ -88,6 +88,13 @@ def test_version_names_the_libraries() -> None:
         (["convert", "broken.g2o", "one.tum"], BAD_FILE, "broken.g2o:2: "),
         (["simulate", "manhattan"], USAGE, "there is nothing to write"),
         (["simulate", "atlantis", "--out", "a.g2o"], USAGE, "atlantis"),
+        (
+            ["budget", "yard", "fast"],
+            USAGE,
+            "'fast' is no number; wanted milliseconds from 0 (no bound) to 60000, such as",
+        ),
+        (["budget", "yard", "-1"], USAGE, "is -1.0; wanted milliseconds from 0 (no bound) to 60000"),
+        (["budget", "yard", "1e400"], USAGE, "is inf; wanted milliseconds from 0 (no bound) to 60000"),
         (["serve", "--config", "missing.toml"], BAD_FILE, "missing.toml cannot be read"),
         (["serve", "--config", "wrong.toml"], USAGE, "'lisen' is not a setting"),
         (["work", "--no-warm", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),

@@ -106,7 +106,7 @@ def test_what_cannot_be_changed_is_refused_and_its_neighbours_go_on() -> None:
 
 
 def test_a_fault_in_a_change_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apply, "with_changes", broken)
+    monkeypatch.setattr(apply, "with_changes_within", broken)
     map_solver = make()
     judged, steps = came(map_solver, waiting(gone(4), 6))
     assert [o.answer.code for o in outcomes(judged)] == ["internal"]

@@ -26,10 +26,12 @@ from factorbus.service.journal.library import CopiedAt, Kept, Library, open_libr
 from factorbus.service.journal.recovery import verify
 from factorbus.service.questions.admin import MadeAs
 from factorbus.service.questions.answers import Question
+from factorbus.service.solving import apply
 from factorbus.service.solving.arrival import read_insert
 from factorbus.simulate import manhattan
 from factorbus.solver import Solver
 from factorbus.solver.build import present_build
+from factorbus.solver.errors import Diverged
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.modes import MODE_OF_NAME
 from factorbus.solver.state import FORMAT
@@ -328,6 +330,25 @@ def test_a_step_more_or_less_by_another_build_keeps_no_map_closed(
     changed(tmp_path / "m", "DELETE FROM entry WHERE record = 11")
     with pytest.raises(JournalDiffers, match="record 11 led to revision 12, and leads to 11"):
         reopen()
+
+
+def test_what_another_build_refused_as_diverged_stays_refused(
+    values: dict[int, bytes], reopen: Callable[[], Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This build may take it: the client was told that it did not go in."""
+    session = reopen()
+    monkeypatch.setattr(apply, "find_diverged", lambda *_: Diverged("se2 x1", 1e13, 1e12))
+    session.insert(BATCHES[INSERTS])
+    monkeypatch.undo()
+    before, revision = session.values(), session.map_solver.revision
+    session.close()
+    with pytest.raises(JournalDiffers, match="was refused, and is accepted"):
+        reopen()
+    by_another(tmp_path / "m", processor="elsewhere")
+    session = reopen()
+    assert session.values().keys() == before.keys() == values.keys()
+    assert session.map_solver.revision == revision
+    session.close()
 
 
 def test_a_fork_has_what_is_known_of_the_original(

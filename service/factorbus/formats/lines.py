@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from factorbus.formats.errors import FormatError
+from factorbus.wording.unreadable import mend_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,9 @@ def read_content(path: Path) -> bytes:
             content = gzip.decompress(content)
     except (OSError, EOFError, zlib.error) as failure:  # gzip reports a damaged file in these three ways
         reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else str(failure)
-        wanted = "a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file"
+        mend = "; " + mend_of(failure) if isinstance(failure, OSError) and failure.errno else ""
+        if isinstance(failure, IsADirectoryError):
+            mend += ", or the folder of a map that GLIM has saved, with graph.txt and submaps"
+        wanted = f"a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file{mend}"
         raise FormatError(str(path), None, f"it cannot be read ({reason})", wanted) from failure
     return content.removeprefix(b"\xef\xbb\xbf")

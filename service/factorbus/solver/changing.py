@@ -1,6 +1,7 @@
 """Changes of a map: a solver of the changed map, or the same solver after a step that changed it.  MATH §11."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 from factorbus.solver.changes.convert_to_points import pick_features, with_points
 from factorbus.solver.changes.edited import edited
@@ -14,13 +15,17 @@ from factorbus.solver.solver import Solver
 
 
 def with_changes(
-    solver: Solver, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
+    solver: Solver,
+    changes: Sequence[ChangeLike],
+    batch: BatchLike | None = None,
+    settle: bool = False,
+    within: bool = False,
 ) -> tuple[Solver, int, StepReport, dict[str, int]]:
     """A solver of the same map with `changes` made, in their order, and then `batch` added; `solver` stays as it is.
 
     Gives it, the id of the first factor of `batch`, the report of its first step, and what was changed.  That step
-    relinearizes everything at the estimate and eliminates all anew, whatever the mode.  Nothing may be staged.
-    Raises as `changes.collect`, `stage` and `step` do.
+    relinearizes everything at the estimate and eliminates all anew, whatever the mode; `within`: and goes no further
+    than the bounds of numbers let it.  Nothing may be staged.  Raises as `changes.collect`, `stage` and `step` do.
     """
     edits = collect(solver._graph, changes)
     made = solver._taken_over(edited(solver._graph, edits))
@@ -29,7 +34,9 @@ def with_changes(
     before = made.variable_count, made.factor_count
     first = made._graph.next_id if batch is None else made.stage(batch)
     new = made.variable_count - before[0], made.factor_count - before[1]
-    report = made._stepper.resume(settle)._replace(new_variables=new[0], new_factors=new[1])
+    with made.within_bounds() if within else nullcontext():
+        report = made._stepper.resume(settle)
+    report = report._replace(new_variables=new[0], new_factors=new[1])
     return made, first, report, edits.counted
 
 

@@ -6,15 +6,22 @@ who share it, so such a step does not count.
 
 A step of the tree cannot be taken back when it is done.  So what is of unusual sizes is tried on a copy, and everything
 on a map that has such numbers; where a step diverges all the same, the values are put back and eliminated anew.
+
+Not every insert whose step diverges is to blame: a map that has taken numbers of 10²⁴ and 10⁻²⁴ may run off elsewhere
+when the next one comes.  An insert that has nothing to do with what ran off is made again, within the bounds.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph.escaped import find_beyond
+from factorbus.solver.changes.requested import ChangeLike
+from factorbus.solver.changing import with_changes
+from factorbus.solver.graph.escaped import find_beyond, list_beyond
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.groups import BatchLike
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
@@ -43,6 +50,30 @@ def find_diverged(changed: I64, graph: FactorGraph, report: StepReport) -> error
     if math.isfinite(report.chi2) and math.isfinite(report.chi2_before):
         return None
     return errors.Diverged("χ²", max(report.chi2, report.chi2_before), math.inf)
+
+
+def is_elsewhere(solver: Solver, report: StepReport) -> bool:
+    """Whether all that the last step of `solver`, which gave `report`, left out of bounds is nothing that it brought:
+    no new variable, and no end of a new factor.
+    """
+    changed, graph = solver.pick_changed()
+    beyond = list_beyond(changed, graph)
+    first = int(graph.counts[at.VARIABLES]) - report.new_variables
+    rows = graph.fac[graph.rows_of_first(graph.factor_count - report.new_factors) : graph.counts[at.FACTORS]]
+    own = {*rows[:, at.F_I].tolist(), *rows[:, at.F_J].tolist()}
+    return bool(beyond) and all(v < first and v not in own for v in beyond)
+
+
+def with_changes_within(
+    solver: Solver, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
+) -> tuple[Solver, int, StepReport, dict[str, int]]:
+    """`with_changes` whose step is within its bounds, and is held there if need be.  Raises Diverged, too."""
+    came = with_changes(solver, changes, batch, settle)
+    made, _, report, _ = came
+    if find_diverged(*made.pick_changed(), report) is not None and is_elsewhere(made, report):
+        made, _, report, _ = came = with_changes(solver, changes, batch, settle, within=True)
+    check_step(made, report)
+    return came
 
 
 def is_usual(solver: Solver, variables: int = 0, factors: int = 0) -> bool:

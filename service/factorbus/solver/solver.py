@@ -1,6 +1,7 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any
 
@@ -83,6 +84,15 @@ class Solver:
             return self._stepper.step(settle, self._options.step_budget)
         check_number("step_budget", budget)
         return self._stepper.step(settle, budget, always=True)
+
+    @contextmanager
+    def within_bounds(self) -> Iterator[None]:
+        """While inside, steps go no further than the bounds of numbers let them.  MATH §2.5."""
+        self._stepper.within = True
+        try:
+            yield
+        finally:
+            self._stepper.within = False
 
     def estimate(self) -> list[Group]:
         """A copy of all values: per kind, in insertion order, fixed variables in groups of their own.

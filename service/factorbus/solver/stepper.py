@@ -8,7 +8,12 @@ from factorbus.solver.report import StepReport
 
 
 class Stepper(Protocol):
-    """Solves for what is new in a graph, step by step: `bayes_tree.steps` and `inc_l.steps`."""
+    """Solves for what is new in a graph, step by step: `bayes_tree.steps` and `inc_l.steps`.
+
+    within: steps go no further than the bounds of numbers let them, rather than leave these
+    """
+
+    within: bool
 
     def step(self, settle: bool, budget: float = 0.0, always: bool = False) -> StepReport:
         """Solve for what is new; with `settle` until it has converged, else within `budget`, as `Options.step_budget`,

@@ -5,7 +5,8 @@ import click
 from factorbus.cli.process.options import connect_option, timeout_option, zenoh_option
 
 
-@click.command()
+# What begins with a minus is a number here, to be refused as one.
+@click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("name", metavar="MAP")
 @click.argument("budget", metavar="MS|none")
 @connect_option
@@ -34,9 +35,11 @@ def command(name: str, budget: str, endpoint: str, zenoh: str, timeout_s: float)
 def _read(text: str) -> float:
     if text == "none":
         return 0.0
-    from factorbus.proto.budget import checked_budget
+    from factorbus.proto.budget import BUDGET_WANTED, checked_budget
 
     try:
         return checked_budget(float(text))
     except ValueError:
-        raise click.BadParameter(f"{text!r} is not a number of milliseconds, nor none", param_hint="MS|none") from None
+        raise click.BadParameter(
+            f"{text!r} is no number; wanted {BUDGET_WANTED}, such as 10, or none", param_hint="MS|none"
+        ) from None

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorbus.formats import FormatError
 from factorbus.proto.arrays import F64, I64
+from factorbus.wording.unreadable import mend_of
 
 _NS = re.compile(r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?$")
 
@@ -18,7 +19,8 @@ def text_of(path: Path, wanted: str) -> str:
         return path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as failure:
         reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else "it is not text"
-        raise FormatError(str(path), None, f"it cannot be read ({reason})", wanted) from failure
+        mend = "; " + mend_of(failure) if isinstance(failure, OSError) else ""
+        raise FormatError(str(path), None, f"it cannot be read ({reason})", wanted + mend) from failure
 
 
 def rows_of_numbers(

@@ -12,6 +12,7 @@ import click
 from factorbus.cli.output.console import document
 from factorbus.cli.output.installing import install_command
 from factorbus.proto.problems import Refused
+from factorbus.wording.unreadable import mend_of
 
 OK, FAILED, USAGE, BAD_FILE, UNAVAILABLE, REFUSED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
 
@@ -75,7 +76,8 @@ def input_file(path: Path) -> Iterator[None]:
     except UnicodeDecodeError as error:
         raise Stopped("bad_file", f"{path} is not text: {error.reason}", BAD_FILE, path=str(path)) from error
     except OSError as error:
-        raise Stopped("bad_file", f"{path} cannot be read: {error.strerror}", BAD_FILE, path=str(path)) from error
+        told = f"{path} cannot be read: {error.strerror}; {mend_of(error)}"
+        raise Stopped("bad_file", told, BAD_FILE, path=str(path)) from error
 
 
 @contextmanager

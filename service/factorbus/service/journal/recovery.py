@@ -27,7 +27,7 @@ from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import message_digest, read_again
 from factorbus.service.solving.tested import entry_again
 from factorbus.solver.build import differences, present_build
-from factorbus.solver.errors import SolverError
+from factorbus.solver.errors import Diverged, SolverError
 from factorbus.solver.state import FORMAT
 
 log = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ class _History:
         that cost a step more or less, revisions are counted as the journal has them.
         """
         store, map_solver = self._store, self._map_solver
-        present = self._apply(record, before)
+        present = self._apply(record, before, other)
         if map_solver.revision != record.revision:
             tried = record.further or record.rebuilt or any(entry.outcome != UNTRIED for entry in record.entries)
             if not (other and tried):
@@ -106,8 +106,9 @@ class _History:
             map_solver.count_from(record.revision)
         return present
 
-    def _apply(self, record: JournalRecord, present: bytes) -> bytes:
-        inserts = [arrived_again(entry) for entry in record.entries if entry.outcome != UNTRIED]
+    def _apply(self, record: JournalRecord, present: bytes, other: bool) -> bytes:
+        entries = [entry for entry in record.entries if entry.outcome != UNTRIED and not (other and _diverged(entry))]
+        inserts = [arrived_again(entry) for entry in entries]
         outcomes: dict[tuple[str, int], int] = {}
         self._map_solver.allow(record.budget)
         for event in self._map_solver.apply_again(inserts, record.rebuilt, record.further):
@@ -120,13 +121,18 @@ class _History:
             else:
                 present = chain.extend_chain(present, event.delta)
                 self.solver_s += event.solver_ms * 1e-3
-        for entry in record.entries:
-            if entry.outcome != UNTRIED and outcomes[entry.client, entry.sequence] != entry.outcome:
+        for entry in entries:
+            if outcomes[entry.client, entry.sequence] != entry.outcome:
                 was, now = ("accepted", "refused") if entry.outcome == ACCEPTED else ("refused", "accepted")
                 raise JournalDiffers(
                     self._store.path, f"insert {entry.sequence} of client {entry.client} was {was}, and is {now}"
                 )
         return present
+
+
+def _diverged(entry: Entry) -> bool:
+    """Whether it was refused since its step ran off, which one of another build need not do."""
+    return entry.outcome == REFUSED and codec.decode_problem(entry.answer).code == Diverged.code
 
 
 def answers(sender: Sender) -> Iterator[tuple[int, int, object]]:

@@ -25,7 +25,7 @@ from itertools import groupby
 from typing import Any, TypeAlias, cast
 
 from factorbus.proto.messages import Insert
-from factorbus.proto.problems import Internal, Problem, TooLarge
+from factorbus.proto.problems import Internal, Problem
 from factorbus.service.config import Limits
 from factorbus.service.core.events import (
     Applied,
@@ -38,17 +38,16 @@ from factorbus.service.core.events import (
     refusal,
 )
 from factorbus.service.solving.holding import Broken, Holding
-from factorbus.solver.changing import try_change, with_changes, with_converted
-from factorbus.solver.divergence import check_step, copied, find_diverged, is_usual
+from factorbus.solver.changing import try_change, with_converted
+from factorbus.solver.divergence import check_step, copied, find_diverged, is_elsewhere, is_usual, with_changes_within
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.columns import Columns
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import I64
 
+WITHIN = "what was inserted before would run off, so this step stays within bounds"
 GOES_ON = "the map goes on converging, without an insert"
 
-_NOTHING: Mapping[str, int] = {}
-_FULL = "go on in another map, or raise the limit"
 
 log = logging.getLogger(__name__)
 
@@ -236,16 +235,39 @@ class MapSolver(Holding):
         except Exception:
             return self._answered_only(staged, refused, self._report_of(report, started))
         if diverged is not None:
-            steps = []
+            elsewhere, steps = is_elsewhere(self._solver, report), list[Stepped]()
             if kept is not None:
                 self._solver = kept
             else:
                 steps = list(self._go_back(report))
             if len(staged) > 1:
                 raise _Undone(steps)
-            return Verdict((*refused, refusal(staged[0][0], diverged))), steps
+            verdict = Verdict((refusal(staged[0][0], diverged),))
+            if elsewhere:
+                verdict, more = self._add_within(staged[0][0], diverged)
+                steps += more
+            return verdict._replace(outcomes=(*verdict.outcomes, *refused)), steps
         self._wary = self._wary or kept is not None
         return self._answered_and_published(staged, refused, self._report_of(report, started), (changed, graph))
+
+    def _add_within(self, insert: Arrived, diverged: Problem | SolverError) -> _Added:
+        """An insert whose step `diverged` where it has no part, made again: within the bounds, and on a copy."""
+        started, kept = time.perf_counter(), self._solver
+        try:
+            self._solver = copied(kept)
+            first_factor, _ = self._stage(insert, self._accepted_counts)
+            with self._solver.within_bounds():
+                report = self._solver.step(cast(Insert, insert.content).settle, self._budget)
+            check_step(self._solver, report)
+            changed = self._solver.pick_changed()
+        except Exception as problem:
+            if not isinstance(problem, Problem | SolverError):
+                log.exception("the solver failed in a step within bounds; the map goes on without it")
+            self._solver = kept
+            return Verdict((refusal(insert, diverged),)), ()
+        self._wary = True
+        reported = self._report_of(report._replace(because=f"{WITHIN}: {report.because}"), started)
+        return self._answered_and_published([(insert, first_factor)], (), reported, changed)
 
     def _stage(self, insert: Arrived, counts: tuple[int, int]) -> tuple[int, tuple[int, int]]:
         """Hand one insert to the solver, which holds `counts` variables and factors; gives the id of its first factor,
@@ -261,25 +283,6 @@ class MapSolver(Holding):
         counts = self._check_room(counts, content.batch.variable_count, content.batch.factor_count)
         self._solver.check_new_kinds(content.batch)
         return self._solver.stage(content.batch), counts
-
-    def _check_room(self, counts: tuple[int, int], variables: int, factors: int) -> tuple[int, int]:
-        """How many variables and factors the map has with these.  Raises TooLarge beyond its limits."""
-        limits, with_them = self._limits, (counts[0] + variables, counts[1] + factors)
-        if with_them[0] > limits.variables:
-            raise TooLarge("the map with this insert", with_them[0], limits.variables, "variables", _FULL)
-        if with_them[1] > limits.factors:
-            raise TooLarge("the map with this insert", with_them[1], limits.factors, "factors", _FULL)
-        return with_them
-
-    def _report_of(self, report: Any, started: float, counted: Mapping[str, int] = _NOTHING) -> dict[str, Any]:
-        """What the answers and the delta of a step say of it; the map is at its revision then."""
-        reported = report.as_dict()
-        reported.update(counted)
-        reported["solver_ms"] = (time.perf_counter() - started) * 1e3
-        self._next(reported)
-        variables, factors = self._accepted_counts
-        self._accepted_counts = variables + report.new_variables, factors + report.new_factors
-        return reported
 
     def _answered_and_published(
         self, staged: Sequence[_Staged], refused: Sequence[Outcome], reported: dict[str, Any],
@@ -332,10 +335,9 @@ class MapSolver(Holding):
         """The same in a new solver."""
         content = cast(Insert, insert.content)
         try:
-            solver, first_factor, report, counted = with_changes(
+            solver, first_factor, report, counted = with_changes_within(
                 self._solver, content.changes, content.batch, content.settle
             )
-            check_step(solver, report)
         except (Problem, SolverError) as problem:
             yield Verdict((refusal(insert, problem),))
             return

@@ -18,7 +18,7 @@ from factorbus.proto.arrays import I64
 from factorbus.proto.budget import BUDGET_OPTION
 from factorbus.proto.closures import Suspects, encode_suspects
 from factorbus.proto.keep import KEEP_ALL, KEEP_OPTION, try_keep
-from factorbus.proto.problems import Problem
+from factorbus.proto.problems import Problem, TooLarge
 from factorbus.service.config import Limits
 from factorbus.service.core.budget import use_of
 from factorbus.service.core.events import Arrived, Stepped
@@ -33,6 +33,8 @@ from factorbus.solver.divergence import check_step, is_usual, undone
 # Until a copy of a map is at work there are the state on its way, the same as bytes of a file, and the copy itself;
 # each up to twice what the solver has in use, as arrays double when they grow (measured: 1.7 times for 10,000 poses).
 _COPIES = 6
+_NOTHING: Mapping[str, int] = {}
+_FULL = "go on in another map, or raise the limit"
 
 log = logging.getLogger(__name__)
 
@@ -206,6 +208,25 @@ class Holding:
         strategy, solver_ms = str(reported.get("strategy", "")), float(reported.get("solver_ms", 0.0))
         made = Stepped(self._revision, delta, strategy, self.chi2(), solver_ms)
         return made._replace(converged=self._converged, unfinished=self._unfinished, **_kept_of(reported))
+
+    def _check_room(self, counts: tuple[int, int], variables: int, factors: int) -> tuple[int, int]:
+        """How many variables and factors the map has with these.  Raises TooLarge beyond its limits."""
+        limits, with_them = self._limits, (counts[0] + variables, counts[1] + factors)
+        if with_them[0] > limits.variables:
+            raise TooLarge("the map with this insert", with_them[0], limits.variables, "variables", _FULL)
+        if with_them[1] > limits.factors:
+            raise TooLarge("the map with this insert", with_them[1], limits.factors, "factors", _FULL)
+        return with_them
+
+    def _report_of(self, report: Any, started: float, counted: Mapping[str, int] = _NOTHING) -> dict[str, Any]:
+        """What the answers and the delta of a step say of it; the map is at its revision then."""
+        reported = report.as_dict()
+        reported.update(counted)
+        reported["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._next(reported)
+        variables, factors = self._accepted_counts
+        self._accepted_counts = variables + report.new_variables, factors + report.new_factors
+        return reported
 
     def memory_bytes(self) -> int:
         """What its solver has in use."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.bayes_tree.tree import CliqueTree
+from factorbus.solver.graph.escaped import find_beyond
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -46,6 +47,7 @@ _CORRECTED = "residuals taken anew in a chord step"
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
+_WITHIN = "numbers would have left their bounds: Levenberg-Marquardt within them"
 _STALLS = "a step with nothing new did not lower χ²: Levenberg-Marquardt to the optimum"
 _NO_BUDGET = (0, 0.0, 0.0, 0.0, True)
 _new = tuple.__new__
@@ -54,12 +56,12 @@ _new = tuple.__new__
 class TreeSteps:
     """Solves for what is new in a graph, step by step."""
 
-    NOT_KEPT = ("_graph", "_options", "before_batch")
+    NOT_KEPT = ("_graph", "_options", "before_batch", "within")
 
     def __init__(self, graph: FactorGraph, options: Options) -> None:
         self._graph, self._options = graph, options
         self._tree = CliqueTree(graph, options)
-        self._mark = graph.mark()
+        self._mark, self.within = graph.mark(), False
         self._first_new, self._batched, self._at_linearization = 0, False, False
         self._damping = 0.0  # with which a batch ended that had not converged: the next one goes on from it
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
@@ -100,11 +102,12 @@ class TreeSteps:
                 tree.set_budget(math.inf)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
+        escaped = self._has_escaped
         stands = not tree.state.item(tl.S_AFTER) and (bounded or not self._stalls)
-        if not settle and (stands or (bounded and self._is_tolerable)):
+        if not settle and not escaped and (stands or (bounded and self._is_tolerable)):
             self._damping = 0.0
             return self._report(started, compiled, None, because, budget if bounded else 0.0)
-        result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
+        result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because, escaped)
         return self._report(started, compiled, result, because, budget if bounded else 0.0)
 
     def resume(self, settle: bool) -> StepReport:
@@ -183,6 +186,11 @@ class TreeSteps:
         return self._tree.behind and math.isfinite(chi2) and chi2 <= most
 
     @property
+    def _has_escaped(self) -> bool:
+        """Whether the tree's last step left its bounds, where it is to stay within them."""
+        return self.within and find_beyond(self._tree.list_changed(self._mark[at.VARIABLES]), self._graph) >= 0
+
+    @property
     def _gained(self) -> float:
         """By how much the tree's last step lowered χ²."""
         return self._tree.totals.item(tl.T_BEFORE) - self._tree.totals.item(tl.T_CHI2)
@@ -217,22 +225,24 @@ class TreeSteps:
         system.factorize(0.0)
         return f"only several factors together hold {counted(suspects.size, 'new variable')}"
 
-    def _complete(self, settle: bool, because: str) -> tuple[Minimization | None, str]:
+    def _complete(self, settle: bool, because: str, escaped: bool) -> tuple[Minimization | None, str]:
         """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
         tree, after = self._tree, self._tree.state.item(tl.S_AFTER)
         chi2, chi2_before = tree.totals.item(tl.T_CHI2), tree.totals.item(tl.T_BEFORE)
         result, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
+        taken_back = escaped
         continues = self._graph.mark() == self._mark
         goes_on = after & tl.RAISED and continues and not self._is_within(_AT_END, chi2)
-        if settle or worse or rises or goes_on or self._stalls:
+        if settle or escaped or worse or rises or goes_on or self._stalls:
             tree.exchange()
             before = self._graph.values.copy()
             # After a torn estimate a whole one may have the lower χ², and be worse than when nothing was behind.
-            if not (worse and not chi2 <= chi2_before) and not (continues and self._gained < 0.0):
+            taken_back |= bool(worse and not chi2 <= chi2_before) or (continues and self._gained < 0.0)
+            if not taken_back:
                 tree.exchange()
-            result = self._batch(before, settle, continues)
-            reasons = (settle, _ASKED), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON), (True, _STALLS)
-            because = next(reason for holds, reason in reasons if holds)
+            result = self._batch(before, settle, continues, taken_back)
+            reasons = (settle, _ASKED), (escaped, _WITHIN), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON)
+            because = next((reason for holds, reason in reasons if holds), _STALLS)
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum: nothing by the
             # tree's own step, too, which may take off what damped ones cannot.  It says nothing where the tree could
             # not be eliminated where these ended, and is elsewhere.
@@ -276,15 +286,17 @@ class TreeSteps:
         system.factor.moved()
         return system
 
-    def _batch(self, before: F64, settle: bool, continues: bool) -> Minimization:
+    def _batch(self, before: F64, settle: bool, continues: bool, taken_back: bool) -> Minimization:
         """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows, and stays where they
         end if its own step from there would raise χ².
 
-        before: the values as they were before the step.  continues: with nothing new
+        before: the values as they were before the step.  continues: with nothing new.  taken_back: the tree's own step
+        was, and so the tree is elsewhere
         """
         options, self.before_batch = self._options, before
         system = self._system(self._graph)
         system.begin(np.empty(0, np.int64), Stopwatch(None))
+        system.within = self.within
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
         rule = (further_rule if continues else ordinary_rule)(options, options.batch_tolerance)
         damping = self._damping if continues and not settle else 0.0
@@ -293,10 +305,11 @@ class TreeSteps:
         elif damping:
             rule = replace(rule, nonmonotone=0)
         result = minimize(system, chi2, damping, rule)
-        if result.iterations or not settle:
+        if result.iterations or taken_back or not settle:
             self._tree.move_all()
             self._tree.step()
-            self._at_linearization = not self._tree.totals[tl.T_CHI2] <= result.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN
+            most = result.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN
+            self._at_linearization = not self._tree.totals[tl.T_CHI2] <= most or self._has_escaped
             if self._at_linearization:
                 self._tree.reset_to_linearization()
         count = int(self._graph.counts[at.VARIABLES])

@@ -3,9 +3,9 @@
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.kernels.jit.compile import I64
+from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.bounds import LEAST_SCALE, find_escaped
+from factorbus.solver.kernels.model.bounds import LEAST_SCALE, find_escaped, find_first_outside
 
 # Where the scale of a `sim3` is among its numbers.
 SCALE_OF_SIM3 = 7
@@ -27,3 +27,22 @@ def find_beyond(changed: I64, graph: FactorGraph) -> int:
         if small.size:
             return int(changed[small[0]])
     return -1
+
+
+def are_all_within(graph: FactorGraph, values: F64) -> bool:
+    """Whether all variables of `graph` would be within their bounds with these values."""
+    count = int(graph.counts[at.VARIABLES])
+    if find_first_outside(0, count, graph.var, values) >= 0:
+        return False
+    scaled = graph.var[:count]
+    scaled = scaled[scaled[:, at.V_KIND] == at.SIM3]
+    return not scaled.size or bool((values[scaled[:, at.V_AT] + SCALE_OF_SIM3] >= LEAST_SCALE).all())
+
+
+def list_beyond(changed: I64, graph: FactorGraph) -> list[int]:
+    """All of the variables `changed` that `find_beyond` would give."""
+    found = list[int]()
+    while (v := find_beyond(changed, graph)) >= 0:
+        found.append(v)
+        changed = changed[changed != v]
+    return found

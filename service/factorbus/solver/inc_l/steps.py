@@ -64,7 +64,7 @@ STATE_TYPES = (_Done, Symbolic, Where)
 class IncrementalSteps:
     """Solves for what is new in a graph, step by step.  A `Stepper`."""
 
-    NOT_KEPT = ("_graph", "_options", "_mode")
+    NOT_KEPT = ("_graph", "_options", "_mode", "within")
 
     def __init__(self, graph: FactorGraph, options: Options) -> None:
         self._graph, self._options = graph, options
@@ -72,6 +72,7 @@ class IncrementalSteps:
         self._system = System(graph, Incremental(Elimination(options), options))
         self._changed: I64 = np.empty(0, np.int64)
         self._trust, self._moves = 1.0, 0
+        self.within = False
         self._done = _Done(graph.mark())
 
     @property
@@ -217,6 +218,7 @@ class IncrementalSteps:
         elif goes_on:
             rule = further_rule(options, tolerance)
         system.begin(suspects, watch)
+        system.within = self.within
         result = None
         if self._mode.batch_every and not batch:
             result = try_linear_step(system, chi2, rule)

@@ -1,10 +1,12 @@
 """The least-squares problem of a graph as Gauss-Newton sees it: a point, normal equations, a step, a trial."""
 
+import math
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from factorbus.solver import errors
+from factorbus.solver.graph.escaped import are_all_within
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -22,9 +24,12 @@ _FREE_DIRECTION = (
 
 
 class System(Generic[R]):
-    """Λ, η and R of a graph at its present values.  A `LeastSquares` between `begin` and `end` of a step."""
+    """Λ, η and R of a graph at its present values.  A `LeastSquares` between `begin` and `end` of a step.
 
-    NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph")
+    within: what would leave its bounds counts as having an infinite χ², so that no step leads there
+    """
+
+    NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph", "within")
 
     def __init__(self, graph: FactorGraph, factor: R) -> None:
         self.graph = graph
@@ -33,7 +38,7 @@ class System(Generic[R]):
         self._before: F64 = np.zeros(0)
         self._kept: F64 = np.zeros(0)
         self._trial: F64 = np.zeros(0)
-        self._moved = False
+        self._moved, self.within = False, False
         self._have_lambda, self.drifted = True, False
         self._spare_is_here = False
         self.drifted = False  # η is that of the linear model, not of the present point
@@ -77,6 +82,8 @@ class System(Generic[R]):
         move(int(self.graph.counts[at.VARIABLES]), self.graph.var, self.graph.values, step, self._trial)
         self._watch.lap("move")
         self._spare_is_here = False
+        if self.within and not are_all_within(self.graph, self._trial):
+            return math.inf
         chi2 = self.blocks.relinearize(self.graph, self._trial)
         self._watch.lap("linearize")
         return chi2

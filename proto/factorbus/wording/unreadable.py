@@ -1,0 +1,14 @@
+"""What to do about a file that cannot be read, for a person."""
+
+_OTHERWISE = "look whether its disk is there and sound"
+
+
+def mend_of(error: OSError) -> str:
+    """The next step after `error`, which says itself what went wrong."""
+    if isinstance(error, IsADirectoryError):
+        return "it is a folder: name a file in it"
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
+        return "look for its name with ls; a path that does not begin with / is from the folder you are in"
+    if isinstance(error, PermissionError):
+        return "have its owner allow it, chmod a+r, or run this as its owner"
+    return _OTHERWISE
