@@ -47,6 +47,8 @@ def compiled():
     assert pick(a, -2) == 9.0 and like_ours(a, -1) == 15.0
     assert [part.tolist() for part in rows(a.reshape(2, 3), 2)] == [[3.0, 5.0, 7.0], [3.0, 4.0, 5.0]]
     text = "".join(ir for one in (pick, rows, like_ours) for ir in one.inspect_llvm().values())
+    # Before 0.67 Numba names what it keeps by where that is, which is elsewhere in every process.
+    text = re.sub(r"(pickle(?:data|buf)\\.|at 0x)[0-9a-f]+", r"\\1", text)
     # Functions are numbered as they are made, and so the names that have the number are of another length.
     return re.sub(r"\\[\\d+ x i8\\] c.missing", "missing", re.sub(r"B(\\d+)v\\d+", "B", text))
 
