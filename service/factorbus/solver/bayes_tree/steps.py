@@ -49,8 +49,6 @@ _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
 _WITHIN = "numbers would have left their bounds: Levenberg-Marquardt within them"
 _STALLS = "a step with nothing new did not lower χ²: Levenberg-Marquardt to the optimum"
-# Steps with a budget that may leave χ² higher than it was, up to MOST_RISE times, before Levenberg-Marquardt follows.
-_MOST_WORSE = 8
 _NO_BUDGET = (0, 0.0, 0.0, 0.0, True)
 _new = tuple.__new__
 
@@ -65,7 +63,6 @@ class TreeSteps:
         self._tree = CliqueTree(graph, options)
         self._mark, self.within = graph.mark(), False
         self._first_new, self._batched, self._at_linearization = 0, False, False
-        self._worse = 0  # steps in a row that left χ² higher than it had been, with nothing behind
         self._damping = 0.0  # with which a batch ended that had not converged: the next one goes on from it
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
         self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
@@ -108,9 +105,8 @@ class TreeSteps:
         escaped = self._has_escaped
         stands = not tree.state.item(tl.S_AFTER) and (bounded or not self._stalls)
         if not settle and not escaped and (stands or (bounded and self._is_tolerable)):
-            self._damping, self._worse = 0.0, 0 if stands else self._worse + (not self._tree.behind)
+            self._damping = 0.0
             return self._report(started, compiled, None, because, budget if bounded else 0.0)
-        self._worse = 0
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because, escaped)
         return self._report(started, compiled, result, because, budget if bounded else 0.0)
 
@@ -167,7 +163,7 @@ class TreeSteps:
     @property
     def complete(self) -> bool:
         """Whether the last step left nothing for later ones."""
-        return not (self._tree.deferred or self._tree.behind or self._worse)
+        return not (self._tree.deferred or self._tree.behind)
 
     @property
     def _has_new(self) -> bool:
@@ -184,12 +180,10 @@ class TreeSteps:
 
     @property
     def _is_tolerable(self) -> bool:
-        """Whether the tree's last step may stand though χ² rose: it left a part behind, so that χ² says little yet, or
-        what its budget has put off may lower it in the next few steps.
-        """
+        """Whether the tree's last step may stand though χ² rose: it left a part behind, so that χ² says little yet."""
         totals = self._tree.totals
         chi2, most = totals.item(tl.T_CHI2), MOST_RISE * (totals.item(tl.T_WHOLE) + LEAST_CHI2)
-        return (self._tree.behind or self._worse < _MOST_WORSE) and math.isfinite(chi2) and chi2 <= most
+        return self._tree.behind and math.isfinite(chi2) and chi2 <= most
 
     @property
     def _has_escaped(self) -> bool:

@@ -27,8 +27,6 @@ from factorbus.solver.options import Options
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 
 _FEW = 8  # new variables for which good first values are looked for
-
-
 PLANNED = 0.9  # of a budget: what the parts of a step take is known beforehand to a tenth or so
 
 

@@ -9,8 +9,6 @@ chosen, from the root down: those first in which most error is corrected for the
     4  take       subtrees, as many as fit
 """
 
-import math
-
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -20,7 +18,15 @@ from factorbus.solver.kernels.bayes_tree.linearization_error import moves_far
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.relinearize import MOVES
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
-from factorbus.solver.kernels.bayes_tree.work import ORDERING, RELINEARIZING, SCANNING, SOLVING, note_work, work_of_clique, work_of_solving
+from factorbus.solver.kernels.bayes_tree.work import (
+    ORDERING,
+    RELINEARIZING,
+    SCANNING,
+    SOLVING,
+    note_work,
+    work_of_clique,
+    work_of_solving,
+)
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of
@@ -103,7 +109,7 @@ def list_considered(graph: Graph, tree: Tree, least: float, room: float) -> I64:
 
 @part
 def choose_among(considered: I64, graph: Graph, tree: Tree, f1: int, room: float, least: float) -> I64:
-    """Those of the variables that fit into `room`, with what new factors and back-substitution take, or into `least`."""
+    """Those of the variables that fit into `room`, with all else that the step does, or by themselves into `least`."""
     clique, state = tree.clique, tree.state
     fate, listed = np.zeros(len(clique), np.int64), np.empty(len(clique), np.int64)
     # 2
