@@ -27,6 +27,7 @@ from factorbus.solver.options import Options
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 
 _FEW = 8  # new variables for which good first values are looked for
+PLANNED = 0.9  # of a budget: what the parts of a step take is known beforehand to a tenth or so
 
 
 class CliqueTree(Arenas):
@@ -53,7 +54,7 @@ class CliqueTree(Arenas):
         """What the steps that follow may take, in units of work (`kernels/bayes_tree/work.py`), before they defer the
         rest; math.inf: they have no bound.
         """
-        self.settings[tl.P_BUDGET] = budget
+        self.settings[tl.P_BUDGET] = PLANNED * budget
 
     def clear(self) -> None:
         """Let go of everything: the next step takes in the whole graph."""

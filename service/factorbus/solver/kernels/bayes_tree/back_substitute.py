@@ -85,7 +85,7 @@ def substitute(
                     row, child, above = clique[c], clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
                     if bounded:
                         level[c] = level[above] + 1
-                        if row[tl.C_FIRST] != -1 and (work >= limit or level[c] > deepest):
+                        if row[tl.C_FIRST] != -1 and (work + work_of_solving(row) > limit or level[c] > deepest):
                             rg.leave_behind(above, clique)
                             continue
                     behind = row[tl.C_MOVES] & tl.BEHIND != 0

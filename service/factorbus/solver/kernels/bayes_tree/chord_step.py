@@ -8,7 +8,8 @@ factor, r₀ + J₀ δ, is corrected by what it misses of the residual at the es
 
 with J₀ as it is in R.  So only right-hand sides change:
 
-1  correct        the gradients of the factors whose model misses much
+1  list, mark     the factors whose model misses much, their cliques and those above: does it fit into the budget?
+   correct        the gradients of these factors
 2  forward_solve  d = R⁻ᵀ η in their cliques and those above, children first
 3  substitute     back down, as in any step
 4  measure        what is left to miss is counted from there
@@ -31,7 +32,7 @@ from factorbus.solver.kernels.bayes_tree.missed_residual import (
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
-from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work, work_of_solving
+from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work, work_of_solving_all
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
 from factorbus.solver.kernels.jit.simd import at as load
@@ -42,6 +43,7 @@ from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se3 import rotation_matrix, turn_slope
 from factorbus.solver.kernels.sparse import fronts as fr
 
+TOO_MUCH = -1.0
 FORWARD = 2.0  # times what back-substitution takes: the gradients are gathered as well
 
 
@@ -62,23 +64,35 @@ def error_left(tree: Tree) -> float:
 
 @part
 def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
-    """Correct the factors whose error² is more than `least`, and solve with R as it is; gives Σ error² as `measure`."""
+    """Correct the factors whose error² is more than `least`, and solve with R as it is; gives Σ error² as `measure`, or
+    TOO_MUCH: that does not fit into the budget, and nothing is done.
+    """
     node, clique, state = tree.node, tree.clique, tree.state
     now = cycles()
     # 1
     note_work(SCANNING * state[tl.S_FACTORS], tree.totals)
     state[tl.S_STAMP] += 1
-    scratch, end = make_scratch(), tree.marked.size
+    corrected, count, end = np.empty(state[tl.S_FACTORS], np.int64), 0, tree.marked.size
     for f in range(state[tl.S_FACTORS]):
         if tree.factor_errors[f, tl.E_ERROR] > least and is_correctable(f, tree.link):
-            correct_factor(graph, tree, f, scratch)
+            corrected[count] = f
+            count += 1
             for a in range(2):
-                v = graph.fac[f, at.F_I + a]
-                note_moved(MODEL, v, node, tree.moved, state)
-                end = mark_above(v, node, clique, state, tree.marked, end)
+                end = mark_above(graph.fac[f, at.F_I + a], node, clique, state, tree.marked, end)
+    marked = tree.marked[end:].copy()
+    work = work_of_solving_all(marked, clique)
+    if tree.totals[tl.T_WORK] + (FORWARD + 1.0) * work > settings[tl.P_BUDGET]:
+        lap(now, tl.LINEARIZE, state)
+        return TOO_MUCH
+    scratch = make_scratch()
+    for k in range(count):
+        correct_factor(graph, tree, corrected[k], scratch)
+        for a in range(2):
+            note_moved(MODEL, graph.fac[corrected[k], at.F_I + a], node, tree.moved, state)
     now = lap(now, tl.LINEARIZE, state)
     # 2
-    roots = forward_solve(graph, tree, tree.marked[end:].copy())
+    note_work(FORWARD * work, tree.totals)
+    roots = forward_solve(graph, tree, marked)
     now = lap(now, tl.ELIMINATE, state)
     # 3
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
@@ -186,11 +200,9 @@ def forward_solve(graph: Graph, tree: Tree, cliques: I64) -> I64:
     """d and the right-hand sides of update matrices anew, in `cliques`, children first; gives those that are roots."""
     var, clique, lists, numbers = graph.var, tree.clique, tree.lists, tree.numbers
     state, totals = tree.state, tree.totals
-    widest, count, work = 0, 0, 0.0
+    widest, count = 0, 0
     for k in range(cliques.size):
-        work += work_of_solving(clique[cliques[k]])
         widest = max(widest, clique[cliques[k], tl.C_PIVOTS] + clique[cliques[k], tl.C_SEPARATOR_SCALARS] + 1)
-    note_work(FORWARD * work, totals)
     eta, roots = np.empty(widest), np.empty(cliques.size, np.int64)
     for k in range(cliques.size):
         row = clique[cliques[k]]

@@ -9,8 +9,6 @@ chosen, from the root down: those first in which most error is corrected for the
     4  take       subtrees, as many as fit
 """
 
-import math
-
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -20,7 +18,15 @@ from factorbus.solver.kernels.bayes_tree.linearization_error import moves_far
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.relinearize import MOVES
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
-from factorbus.solver.kernels.bayes_tree.work import SCANNING, SOLVING, note_work, work_of_clique
+from factorbus.solver.kernels.bayes_tree.work import (
+    ORDERING,
+    RELINEARIZING,
+    SCANNING,
+    SOLVING,
+    note_work,
+    work_of_clique,
+    work_of_solving,
+)
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of
@@ -28,9 +34,9 @@ from factorbus.solver.kernels.model.records import Graph
 
 # Of the budget: what is kept for back-substitution at the most, and what a relinearization may take at least.
 KEPT, LEAST = 0.25, 0.125
+HEADROOM = 1.1  # times as much as reckoned is what it takes to eliminate cliques again, which get another order
 LOOKING = 20_000.0  # of each variable that is considered
 FEWEST = 256  # that are considered
-CHORD = 3.0  # times what back-substitution takes: there is the forward solve as well
 TRIES = 200  # cliques that are looked at from the root down, at most
 ENOUGH = 0.75  # of the budget: where less of it is used there may be another round
 # Times χ² of before, from which on it is found out in the same step whether what is behind is all there is to it, and
@@ -52,23 +58,39 @@ def choose_due(graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
     state = tree.state
     if not (may_try(state) or state[tl.S_CONTINUES] != 0) or state[tl.S_BEHIND] != 0:
         return tree.pending[:0].copy()
-    moving = choose_among(list_considered(graph, tree, -1.0, settings), graph, tree, f1, settings)
-    if moving.size == state[tl.S_PENDING]:
+    budget = settings[tl.P_BUDGET]
+    least = least_room(state, budget)
+    room = max(budget - tree.totals[tl.T_WORK], least)
+    # All of them, if they fit: more than this many do not.
+    moving = tree.pending[:0].copy()
+    if state[tl.S_PENDING] * (RELINEARIZING + ORDERING) <= room:
+        considered = list_considered(graph, tree, -1.0, room)
+        moving = choose_among(considered, graph, tree, f1, max(budget - tree.totals[tl.T_WORK], least), least)
+    if moving.size == state[tl.S_PENDING] or room <= 0.0:
         return moving
     # A step that gained much has all relinearized that has a part in a much smaller sum than what keeps the map from
     # having converged: what does not fit of that is not worth the steps that follow.
     # What is left alone has all relinearized in time.
     share = FINISHED if state[tl.S_CONTINUES] != 0 else settings[tl.P_CONVERGED]
-    least = PASSED_OVER * share * (tree.totals[tl.T_CHI2] + LEAST_CHI2) / state[tl.S_FACTORS]
-    return choose_among(list_considered(graph, tree, least, settings), graph, tree, f1, settings)
+    error = PASSED_OVER * share * (tree.totals[tl.T_CHI2] + LEAST_CHI2) / state[tl.S_FACTORS]
+    considered = list_considered(graph, tree, error, room)
+    return choose_among(considered, graph, tree, f1, max(budget - tree.totals[tl.T_WORK], least), least)
+
+
+@inline_kernel
+def least_room(state: I64, budget: float) -> float:
+    """What a step has for it at least: one with nothing new, and every RETRY-th, so that something is done however
+    tight the budget is.
+    """
+    return LEAST * budget if state[tl.S_CONTINUES] != 0 or state[tl.S_STEP] % RETRY == 0 else 0.0
 
 
 @part
-def list_considered(graph: Graph, tree: Tree, least: float, settings: F64) -> I64:
+def list_considered(graph: Graph, tree: Tree, least: float, room: float) -> I64:
     """The variables that wait and have a factor with an error² of more than `least`, of as many as may be looked at."""
     node, pending, state = tree.node, tree.pending, tree.state
     count = state[tl.S_PENDING]
-    most = min(count, max(FEWEST, int(KEPT * settings[tl.P_BUDGET] / LOOKING)))
+    most = min(count, max(FEWEST, int(KEPT * room / LOOKING)))
     # Where there are more, those of another part of the list in each step.
     first, n, found = (state[tl.S_STEP] * most) % count if most < count else 0, 0, np.empty(most, np.int64)
     for k in range(first, first + most):
@@ -86,30 +108,37 @@ def list_considered(graph: Graph, tree: Tree, least: float, settings: F64) -> I6
 
 
 @part
-def choose_among(considered: I64, graph: Graph, tree: Tree, f1: int, settings: F64) -> I64:
-    """Those of the variables that fit into what the budget leaves for them."""
-    clique, state, budget = tree.clique, tree.state, settings[tl.P_BUDGET]
+def choose_among(considered: I64, graph: Graph, tree: Tree, f1: int, room: float, least: float) -> I64:
+    """Those of the variables that fit into `room`, with all else that the step does, or by themselves into `least`."""
+    clique, state = tree.clique, tree.state
     fate, listed = np.zeros(len(clique), np.int64), np.empty(len(clique), np.int64)
     # 2
     end = want_changed(graph, tree, f1, fate, listed)
-    used = tree.totals[tl.T_WORK]
+    used = 0.0
     for k in range(end, listed.size):
         fate[listed[k]] = TAKEN
-        used += work_of_clique(clique[listed[k]])
+        used += work_of_both(clique[listed[k]])
     work, gain = np.zeros(len(clique)), np.zeros(len(clique))
     for k in range(considered.size):
         end = want_factors_of(considered[k], graph, tree, fate, gain, listed, end)
+        work[tree.node[considered[k], tl.N_CLIQUE]] += RELINEARIZING
     # 3
     wanted = listed[end:]
     for k in range(wanted.size):
         c, above = wanted[k], clique[wanted[k], tl.C_PARENT]
-        work[c] += work_of_clique(clique[c]) if fate[c] == WANTED else 0.0
+        work[c] += work_of_both(clique[c]) if fate[c] == WANTED else 0.0
         if above >= 0:
             work[above], gain[above] = work[above] + work[c], gain[above] + gain[c]
     # 4
-    kept = min(KEPT * budget, SOLVING * state[tl.S_VARIABLES])
-    take_subtrees(max(budget - kept - used, LEAST * budget), work, gain, fate, clique, wanted)
+    kept = min(KEPT * room, SOLVING * state[tl.S_VARIABLES])
+    take_subtrees(max((room - kept - used) / HEADROOM, least), work, gain, fate, clique, wanted)
     return list_covered(graph, tree, considered, fate)
+
+
+@inline_kernel
+def work_of_both(row: I64) -> float:
+    """To eliminate a clique again and to solve it, which it always is then."""
+    return work_of_clique(row) + work_of_solving(row)
 
 
 @part
@@ -177,7 +206,7 @@ def take_subtrees(left: float, work: F64, gain: F64, fate: I64, clique: I64, wan
             left -= float(work[c])
             fate[c] = WHOLE
             continue
-        own = work_of_clique(clique[c]) if fate[c] == WANTED else 0.0
+        own = work_of_both(clique[c]) if fate[c] == WANTED else 0.0
         if own > left:
             continue
         left -= own
@@ -222,16 +251,6 @@ def may_try(state: I64) -> bool:
 def may_go_on(tree: Tree, budget: float) -> bool:
     """Whether a step has enough of its budget left for another round."""
     return tree.totals[tl.T_WORK] + SCANNING * tree.state[tl.S_FACTORS] < ENOUGH * budget
-
-
-@inline_kernel
-def fits_chord_step(tree: Tree, budget: float) -> bool:
-    """Whether a chord step does: it looks through all factors, and moves what the step has moved so far."""
-    if budget == math.inf:
-        return True
-    state = tree.state
-    work = SCANNING * state[tl.S_FACTORS] + CHORD * SOLVING * state[tl.S_CHANGED]
-    return tree.totals[tl.T_WORK] + work <= budget
 
 
 @inline_kernel

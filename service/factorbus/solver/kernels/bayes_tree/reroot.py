@@ -64,7 +64,7 @@ def touch_near(graph: Graph, tree: Tree, room: int, f1: int, settings: F64, mark
         settings[tl.P_REROOT_RING_RATIO],
     )
     ring, within, scalars = 0, float(room), 0
-    max_extra = min(max_extra, max(0.0, NEARBY * settings[tl.P_BUDGET] - flops_of(marked[:count], clique)))
+    max_extra = min(max_extra, NEARBY * settings[tl.P_BUDGET])
     while within >= wider * INNERMOST and ring < MOST_RINGS:
         ring, within = ring + 1, within / wider
     for f in range(min(state[tl.S_TAKEN], f1 - 1), f1):

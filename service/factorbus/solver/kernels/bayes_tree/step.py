@@ -23,7 +23,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import add_factors, add_variables, remove_added
 from factorbus.solver.kernels.bayes_tree.begin_step import begin_step
 from factorbus.solver.kernels.bayes_tree.changed_variables import count_differing
-from factorbus.solver.kernels.bayes_tree.chord_step import chord_step
+from factorbus.solver.kernels.bayes_tree.chord_step import TOO_MUCH, chord_step
 from factorbus.solver.kernels.bayes_tree.convergence import (
     check_decrement,
     goes_on,
@@ -35,7 +35,6 @@ from factorbus.solver.kernels.bayes_tree.convergence import (
 from factorbus.solver.kernels.bayes_tree.defer import (
     RETRY,
     choose_due,
-    fits_chord_step,
     is_in_vain,
     is_torn_apart,
     list_moving,
@@ -134,13 +133,14 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
             break
         if put_off or not may_go_on(tree, scaled[tl.P_BUDGET]):
             break
-        if may_keep_factor(tree, scaled) and fits_chord_step(tree, scaled[tl.P_BUDGET]):
-            weighted_error = chord_step(least_error(scaled, state, totals), graph, tree, scaled)
+        if may_keep_factor(tree, scaled):
+            left = chord_step(least_error(scaled, state, totals), graph, tree, scaled)
             began = cycles()
-            totals[tl.T_GAINED] = max(totals[tl.T_GAINED], chi2 - totals[tl.T_CHI2])
-            check_decrement(graph, tree, scaled)
-            if totals[tl.T_CHI2] <= chi2 and not goes_on(weighted_error, scaled, state, totals):
-                break
+            if left != TOO_MUCH:
+                weighted_error, totals[tl.T_GAINED] = left, max(totals[tl.T_GAINED], chi2 - totals[tl.T_CHI2])
+                check_decrement(graph, tree, scaled)
+                if totals[tl.T_CHI2] <= chi2 and not goes_on(weighted_error, scaled, state, totals):
+                    break
         mark_unconverged(graph, tree, scaled)
     changed = tree.changed[: state[tl.S_CHANGED]]
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)

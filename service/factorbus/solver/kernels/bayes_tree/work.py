@@ -39,6 +39,15 @@ def work_of_solving(row: I64) -> float:
 
 
 @inline_kernel
+def work_of_solving_all(cliques: I64, clique: I64) -> float:
+    """The same of several."""
+    work = 0.0
+    for k in range(cliques.size):
+        work += work_of_solving(clique[cliques[k]])
+    return work
+
+
+@inline_kernel
 def note_work(work: float, totals: F64) -> None:
     """The step has taken this much more."""
     totals[tl.T_WORK] += work
