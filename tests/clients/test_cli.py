@@ -126,7 +126,8 @@ def test_with_json_a_failure_is_one_document_too(tmp_path: Path) -> None:
         "file": "missing.g2o",
         "line": None,
         "seen": "it cannot be read (No such file or directory)",
-        "wanted": "a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file",
+        "wanted": "a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file; look for its name with ls; a path "
+        "that does not begin with / is from the folder you are in",
     }
 
 

@@ -53,7 +53,7 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.kernels.looked_back import WORST
 from factorbus.solver.errors import SolverError
 from factorbus.solver.kernels.closures.ahead import list_companions, weigh_residuals
-from factorbus.solver.kernels.closures.back import count_near
+from factorbus.solver.kernels.closures.back import count_in_spread
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
@@ -172,7 +172,7 @@ class ClosureJudge:
             return ledger.odds()
         rows = np.flatnonzero(ledger.is_improbable[: len(ledger.closures)])[-_MOST_COUNTED:]
         spread, table = self.limits[ledger.dim].spread, solver._graph.array_table
-        near = count_near(rows, ledger.ends, ledger.z, table, spread.metres, spread.radians)
+        near = count_in_spread(rows, ledger.ends, ledger.z, table, spread.metres, spread.radians)
         return ledger.odds(near / rows.size)
 
     def _extent(self, solver: Solver, ledger: Ledger) -> float:

@@ -90,7 +90,7 @@ def bound_without(rows: I64, ends: I64, noise: F64, places: I64, known: F64, gra
 
 
 @kernel("int64(int64[::1], int64[:,::1], float64[:,:,::1], int64[::1], float64, float64)")
-def count_near(rows: I64, ends: I64, z: F64, graph_table: I64, metres: float, radians: float) -> int:
+def count_in_spread(rows: I64, ends: I64, z: F64, graph_table: I64, metres: float, radians: float) -> int:
     """How many of some closures are off by this at most, along each axis and about it, at the estimate."""
     graph = graph_at(graph_table)
     var, values, count = graph.var, graph.values, 0
