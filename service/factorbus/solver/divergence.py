@@ -19,7 +19,7 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.changes.requested import ChangeLike
 from factorbus.solver.changing import with_changes
-from factorbus.solver.graph.escaped import find_beyond, list_beyond
+from factorbus.solver.graph.escaped import find_beyond
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import BatchLike
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -57,11 +57,10 @@ def is_elsewhere(solver: Solver, report: StepReport) -> bool:
     no new variable, and no end of a new factor.
     """
     changed, graph = solver.pick_changed()
-    beyond = list_beyond(changed, graph)
     first = int(graph.counts[at.VARIABLES]) - report.new_variables
     rows = graph.fac[graph.rows_of_first(graph.factor_count - report.new_factors) : graph.counts[at.FACTORS]]
-    own = {*rows[:, at.F_I].tolist(), *rows[:, at.F_J].tolist()}
-    return bool(beyond) and all(v < first and v not in own for v in beyond)
+    own = (changed >= first) | np.isin(changed, rows[:, [at.F_I, at.F_J]])
+    return find_beyond(changed[own], graph) < 0 <= find_beyond(changed[~own], graph)
 
 
 def with_changes_within(

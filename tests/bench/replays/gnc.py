@@ -1,4 +1,4 @@
-"""GTSAM's graduated non-convexity as a contestant: a batch at every so many poses, with all that has come until then.
+"""GTSAM's graduated non-convexity as a contestant: a batch at every hundredth pose or so, with all factors until then.
 
 Odometry is known to be right.  A batch starts at the estimate of the one before, and where odometry leads on from it;
 the loss is truncated least squares, GTSAM's own choice.

@@ -48,7 +48,6 @@ from factorbus.solver.kernels.jit.compile import I64
 WITHIN = "what was inserted before would run off, so this step stays within bounds"
 GOES_ON = "the map goes on converging, without an insert"
 
-
 log = logging.getLogger(__name__)
 
 

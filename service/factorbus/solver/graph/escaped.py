@@ -37,12 +37,3 @@ def are_all_within(graph: FactorGraph, values: F64) -> bool:
     scaled = graph.var[:count]
     scaled = scaled[scaled[:, at.V_KIND] == at.SIM3]
     return not scaled.size or bool((values[scaled[:, at.V_AT] + SCALE_OF_SIM3] >= LEAST_SCALE).all())
-
-
-def list_beyond(changed: I64, graph: FactorGraph) -> list[int]:
-    """All of the variables `changed` that `find_beyond` would give."""
-    found = list[int]()
-    while (v := find_beyond(changed, graph)) >= 0:
-        found.append(v)
-        changed = changed[changed != v]
-    return found
