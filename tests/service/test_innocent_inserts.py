@@ -99,6 +99,45 @@ def test_a_step_that_is_taken_back_leaves_numbers(seed: int) -> None:
         assert "not_finite" not in drive("bayes-tree", seed, 30).codes
 
 
+def set_aside(mode: str) -> Map:
+    """A map in which Tukey's loss weighs nothing of what is on l0: its two poses went 100 m away, to either side."""
+    here = Map(mode)
+    poses = Draft().se2("q0", (0, 0, 0), fixed=True).se2("x0", (0, 0, 0)).se2("x1", (1, 0, 0))
+    poses.prior_se2("x0", (0, 0, 0), sigmas=(1, 1, 1)).prior_se2("x1", (1, 0, 0), sigmas=(1, 1, 1))
+    seen = Draft().se2("l0", (0.5, 0, 0))
+    for pose, ahead in (("x0", 0.5), ("x1", -0.5)):
+        seen.between_se2(pose, "l0", (ahead, 0, 0), sigmas=SIGMAS, loss=("tukey", 3))
+    apart = Draft().prior_se2("x0", (-100, 0, 0), sigmas=(1e-3,) * 3).prior_se2("x1", (100, 0, 0), sigmas=(1e-3,) * 3)
+    assert [here.insert(draft.batch()) for draft in (poses, seen, apart)] == ["accepted"] * 3
+    return here
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_a_loss_sets_aside_rests_and_the_rest_goes_on(mode: str) -> None:
+    here, rng = set_aside(mode), np.random.default_rng(1)
+    for i in range(4):
+        assert here.insert(ordinary(i, rng).batch(), settle=i % 2 == 1) == "accepted"
+    fixed = Draft().se2("m0", (0, 0, 0)).prior_se2("m0", (1, 2, 0.3), sigmas=SIGMAS).batch()
+    assert here.insert(fixed, (Change("fix", keys=np.array([symbol("q", 1)])),), settle=True) == "accepted"
+    values = {key: np.frombuffer(value) for key, value in here.estimate().items()}
+    assert values[symbol("m", 0)] == pytest.approx([1, 2, 0.3], abs=1e-9)
+    assert values[symbol("x", 1)] == pytest.approx([100, 0, 0], abs=1e-3)
+    assert np.abs(values[symbol("l", 0)]).max() < 101
+    left_free = Change("remove_factors", np.array([2, 3]))
+    assert here.insert(ordinary(4, rng).batch(), (left_free,)) == "underconstrained"
+
+
+@pytest.mark.parametrize("scale", [1.0, 8e-8])
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_new_is_refused_where_its_loss_sets_all_aside(mode: str, scale: float) -> None:
+    """However little that adds to χ²: with Tukey's loss c²/3."""
+    here, rng = Map(mode), np.random.default_rng(1)
+    assert here.insert(Draft().se2("q0", (0, 0, 0), fixed=True).batch()) == "accepted"
+    far = Draft().point3("l0", (0, 0, 0)).prior_point3("l0", (1e6, 0, 0), sigmas=(1, 1, 1), loss=("tukey", scale))
+    assert here.insert(far.batch()) == "underconstrained"
+    assert here.insert(ordinary(0, rng).batch(), settle=True) == "accepted"
+
+
 def test_an_insert_that_runs_off_itself_is_refused_at_once() -> None:
     """A landmark 400 million km away, by two directions that are parallel, each certain to 10⁻¹² rad."""
     tried, rng = Told("bayes-tree"), np.random.default_rng(1)

@@ -87,11 +87,11 @@ class IncrementalSteps:
 
     def step(self, settle: bool, budget: float = 0.0, always: bool = False) -> StepReport:
         """As `Solver.step`; there is no budget."""
-        return self._step(settle, self._options.initialize_locally)
+        return self._step(settle)
 
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
-        return self._step(settle, initialize_locally=False)
+        return self._step(settle, resumes=True)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
@@ -120,16 +120,16 @@ class IncrementalSteps:
         """Bytes in use for Λ, η and R."""
         return self._system.memory_bytes()
 
-    def _step(self, settle: bool, initialize_locally: bool) -> StepReport:
+    def _step(self, settle: bool, resumes: bool = False) -> StepReport:
         watch = Stopwatch(self._options.clock)
         try:
             # 1. What is new goes to a good place; linearized there it is added to Λ and η.
-            if initialize_locally:
+            if self._options.initialize_locally and not resumes:
                 self._place_new()
             added = self._system.blocks.extend(self._graph, self._done.graph)
             watch.lap("linearize")
             # 2. Is every new variable held by something?
-            suspects = self._suspects()
+            suspects = self._suspects(resumes)
             watch.lap("check")
             # 3. R and d follow.
             plan = self._follow(suspects, watch)
@@ -153,8 +153,11 @@ class IncrementalSteps:
             variables, factors = (mark[at.VARIABLES], counts[at.VARIABLES]), (mark[at.FACTORS], counts[at.FACTORS])
             initialize_new(*variables, *factors, self._options.tuning.chi2_epsilon, self._graph.array_table)
 
-    def _suspects(self) -> I64:
-        """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold."""
+    def _suspects(self, resumes: bool) -> I64:
+        """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold.
+
+        A loss may have set aside all that is on a variable: one that is new is refused then, an old one rests.
+        """
         suspects = find_undetermined(self._graph, self._done.graph)
         if suspects.size:
             free = find_unanchored(self._graph, self._done.graph)
@@ -164,6 +167,10 @@ class IncrementalSteps:
                     "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to "
                     "the rest of the map",
                 )
+        if not resumes:
+            new = np.arange(self._done.graph[at.VARIABLES], int(self._graph.counts[at.VARIABLES]))
+            free = new[self._graph.var[new, at.V_COLUMN] >= 0]
+            suspects = np.union1d(suspects, self._system.blocks.unweighted(self._graph, free))
         return suspects
 
     def _reason_to_solve(self, added: float, settle: bool, suspects: I64) -> str:
@@ -231,8 +238,9 @@ class IncrementalSteps:
             result = minimize(system, chi2, self._done.damping, rule, have_factor)
             if not (self._mode.updates and result.converged and self._keeps(have_factor, result)):
                 system.have_lambda()
-        if result.failed >= 0 and result.iterations == 0:
-            raise system.underconstrained(system.variable_of(result.failed))
+        failed = system.variable_of(result.failed) if result.failed >= 0 else -1
+        if failed >= self._done.graph[at.VARIABLES] and result.iterations == 0:
+            raise system.underconstrained(failed)
         self._changed = system.end(self._done.graph[at.VARIABLES])
         finished = result.converged and (settle or goes_on)
         if goes_on:

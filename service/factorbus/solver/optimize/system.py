@@ -60,6 +60,8 @@ class System(Generic[R]):
         if not self.drifted:
             self.have_lambda()
         failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
+        if failed >= 0:
+            failed = self._factorize_rest(failed, damping)
         if self._suspects.size and damping == 0.0:
             if failed >= 0:
                 raise self.underconstrained(self.variable_of(failed))
@@ -179,6 +181,18 @@ class System(Generic[R]):
     def variable_of(self, column: int) -> int:
         """The variable that has this block column."""
         return int(np.flatnonzero(self.graph.var[: self.graph.counts[at.VARIABLES], at.V_COLUMN] == column)[0])
+
+    def _factorize_rest(self, failed: int, damping: float) -> int:
+        """Factorize Λ with ones where its diagonal is zero, `suspects` apart: what every loss has set aside rests
+        where it is, as η is zero there, and the rest moves.  −1, or the block column whose pivot failed."""
+        free = np.flatnonzero(self.graph.var[: self.graph.counts[at.VARIABLES], at.V_COLUMN] >= 0)
+        resting = self.blocks.unweighted(self.graph, np.setdiff1d(free, self._suspects, assume_unique=True))
+        if resting.size:
+            entries = self.blocks.put_ones(self.graph, resting)
+            failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
+            self.blocks.data[entries] = 0.0
+            self.factor.moved()
+        return failed
 
     def _solve(self, eta: F64) -> F64:
         self.factor.decrease(eta, self._watch)

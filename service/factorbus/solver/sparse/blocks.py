@@ -56,6 +56,25 @@ class HessianBlocks:
         self.eta[since[at.SCALARS] : int(graph.counts[at.SCALARS])] = 0.0
         return float(linearize(f0, f1, graph.var, graph.fac, graph.values, graph.payload, self.data, self.eta))
 
+    def unweighted(self, graph: FactorGraph, variables: I64) -> I64:
+        """Those of the free `variables` that have a zero on the diagonal of Λ: no factor weighs that scalar there."""
+        at_zero = np.zeros(len(variables), bool)
+        rows = graph.var[variables]
+        dims = graph.dims[rows[:, at.V_COLUMN]]
+        for dim in np.unique(dims).tolist():
+            at_zero[dims == dim] = (self.data[_diagonal(rows[dims == dim], dim)] == 0.0).any(1)
+        return variables[at_zero]
+
+    def put_ones(self, graph: FactorGraph, variables: I64) -> I64:
+        """Set zeros on the diagonal of Λ to one where they are of the free `variables`; gives where in `data`."""
+        found = []
+        for row in graph.var[variables]:
+            entries = _diagonal(row[None], int(graph.dims[row[at.V_COLUMN]]))[0]
+            found.append(entries[self.data[entries] == 0.0])
+        entries = np.concatenate(found)
+        self.data[entries] = 1.0
+        return entries
+
     def relinearize(self, graph: FactorGraph, values: F64) -> float:
         """Build all anew at `values` in the spare copy; gives χ² there."""
         if self._spare_data.size != self.data.size or self._spare_eta.size != self.eta.size:
@@ -97,3 +116,8 @@ class HessianBlocks:
             enter_blocks(int(self.fill[0]), self.table, self.pattern)
         if scalars > self.eta.size:
             self.eta = with_room(self.eta, scalars)
+
+
+def _diagonal(rows: I64, dim: int) -> I64:
+    """(n, dim), where in Λ's numbers the diagonal entries of n free variables of `dim` scalars are."""
+    return rows[:, at.V_DIAGONAL, None] + np.arange(0, dim * dim, dim + 1)
