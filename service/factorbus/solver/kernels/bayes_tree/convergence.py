@@ -11,6 +11,7 @@ from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import joins_places
 from factorbus.solver.kernels.model.records import Graph
 
 MOST_ROUNDS = 10  # of a step that has not converged
@@ -19,7 +20,8 @@ LARGE_GAIN = 0.05  # of χ², in one round or all,
 AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
 MOST_LEFT = 0.5  # of the Σ error² that is allowed: what a chord step may leave, as it counts as a round
 SLOW = 0.1  # times as much error² is allowed after a step that had not converged
-UNCHECKED = 0.2  # of `converged_share` χ²: with more Σ error², and as much changed, the decrement is computed,
+UNCHECKED = 0.2  # of `converged_share` χ²: with more Σ error², and as much changed, the decrement is computed;
+CHANGED = 0.5  # of the Σ error² of the last time: less need not have changed, all in all,
 ABSOLUTE = 0.02  # of the same, where factors of one variable have more error² than that
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
@@ -57,7 +59,7 @@ def check_decrement(graph: Graph, tree: Tree, settings: F64) -> None:
     error, share = totals[tl.T_ERROR], settings[tl.P_CONVERGED] * (totals[tl.T_CHI2] + LEAST_CHI2)
     if state[tl.S_CONTINUES] != 0 or error <= UNCHECKED * share or error > allowed(settings, state, totals):
         totals[tl.T_EXCESS] = 0.0
-    elif totals[tl.T_UNCHECKED] > max(UNCHECKED * share, totals[tl.T_CHECKED]):
+    elif totals[tl.T_UNCHECKED] > max(UNCHECKED * share, CHANGED * totals[tl.T_CHECKED]):
         totals[tl.T_UNCHECKED], totals[tl.T_CHECKED], totals[tl.T_EXCESS] = 0.0, error, 0.0
         if state[tl.S_EXACT] != 0 and error_of_absolute(graph, tree) > ABSOLUTE * share:
             found = decrement(least_error(settings, state, totals), share, graph, tree)
@@ -66,10 +68,11 @@ def check_decrement(graph: Graph, tree: Tree, settings: F64) -> None:
 
 @inline_kernel
 def error_of_absolute(graph: Graph, tree: Tree) -> float:
-    """Σ error² of the factors of one variable: their Jacobians turn alike where a map turns as a whole."""
+    """Σ error² of the factors that say where one variable is, alone or with others that are no places: their Jacobians
+    turn alike where a map turns as a whole."""
     total = 0.0
     for f in range(tree.state[tl.S_FACTORS]):
-        if graph.fac[f, at.F_J] < 0:
+        if graph.fac[f, at.F_J] < 0 or not joins_places(graph.fac[f, at.F_KIND]):
             total += tree.factor_errors[f, tl.E_ERROR]
     return total
 

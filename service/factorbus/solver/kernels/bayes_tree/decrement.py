@@ -6,7 +6,9 @@ far below what is allowed, the forces are added up by variable first:
 
 1  gradient    of the factors with a part in Σ error²: at the estimate, less that of their linear models
 2  forwards    d = R⁻ᵀ g in the cliques of their variables and those above, children first: |d|² is the decrement
-3  backwards   p = R⁻¹ d where that is too much, parents first: R may be old, and what χ² loses along p is less then
+3  backwards   z = R⁻¹ d where that is too much, parents first, and along it what χ² loses: R may be old, and then that
+               is less, or the step is elsewhere.  So 2 and 3 are repeated with the gradient that is left, each
+               direction conjugate to those before: conjugate gradients, preconditioned by R
 """
 
 import numpy as np
@@ -28,10 +30,14 @@ from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
 
+DIRECTIONS = 6  # at most: on old R the first are along what R, and not Λ, hardly holds
+
+
 @part
 def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
     """|R⁻ᵀ g|² with g the gradient that the linear models of all factors with error² of more than `least` miss; where
-    that is more than `most`, what χ² loses by the best step along R⁻¹ R⁻ᵀ g, by the Jacobians at the estimate.
+    that is more than `most`, what χ² loses by the best step in up to `DIRECTIONS` directions, by the Jacobians at the
+    estimate, or in as many as come to more than `most`.
     """
     var, fac, node, clique, state = graph.var, graph.fac, tree.node, tree.clique, tree.state
     g = np.zeros(graph.counts[at.SCALARS])
@@ -49,21 +55,41 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
     cliques, work = tree.marked[end:], 0.0
     for k in range(cliques.size):
         work += work_of_solving(clique[cliques[k]])
-    note_work(SCANNING * state[tl.S_FACTORS] + RELINEARIZING * taken + work, tree.totals)
+    work += SCANNING * state[tl.S_FACTORS] + RELINEARIZING * taken
+    note_work(work, tree.totals)
     # 2
-    square = solve_forwards(graph, tree, cliques, g)
+    z = g.copy()
+    square = solve_forwards(graph, tree, cliques, z)
     if square <= most:
         return square
-    # 3
-    solve_backwards(graph, tree, cliques, g)
-    more, curvature = np.zeros(g.size), square
-    for f in range(state[tl.S_FACTORS]):
-        if tree.factor_errors[f, tl.E_ERROR] > least and not is_member(f, fac):
-            add_difference(graph, tree, f, scratch, g, False, more)
-    for s in range(g.size):
-        curvature += g[s] * more[s]
-    note_work(SCANNING * state[tl.S_FACTORS] + RELINEARIZING * taken + work, tree.totals)
-    return square * min(square / curvature, 1.0) if curvature > 0.0 else square
+    # 3  p: the direction; Mp: RᵀR p; Ap: Λ p at the estimate
+    found, p, Mp = 0.0, np.zeros(g.size), np.zeros(g.size)
+    factor = 0.0
+    for _ in range(DIRECTIONS):
+        solve_backwards(graph, tree, cliques, z)
+        Ap = np.zeros(g.size)
+        for s in range(g.size):
+            p[s] = z[s] + factor * p[s]
+            Mp[s] = g[s] + factor * Mp[s]
+        for f in range(state[tl.S_FACTORS]):
+            if tree.factor_errors[f, tl.E_ERROR] > least and not is_member(f, fac):
+                add_difference(graph, tree, f, scratch, p, False, Ap)
+        note_work(work, tree.totals)
+        curvature = 0.0
+        for s in range(g.size):
+            Ap[s] += Mp[s]
+            curvature += p[s] * Ap[s]
+        if not curvature > 0.0:
+            return square
+        found += square * (square / curvature)
+        if found > most:
+            break
+        for s in range(g.size):
+            g[s] -= square / curvature * Ap[s]
+            z[s] = g[s]
+        before, square = square, solve_forwards(graph, tree, cliques, z)
+        factor = square / before
+    return found
 
 
 @part

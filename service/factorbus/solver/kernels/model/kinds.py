@@ -261,6 +261,12 @@ def end_of_modifier(kind: int, modifier: int) -> int:
 
 
 @inline_kernel
+def joins_places(kind: int) -> bool:
+    """Whether it joins two places in the map, or is of a family, whose variables may be anything."""
+    return JOINS_PLACES[kind]
+
+
+@inline_kernel
 def is_joined(kind: int) -> bool:
     """Whether `many` evaluates a kind of fixed sizes: it has a base, or is of rotations or similarities."""
     return _JOINED[kind]
