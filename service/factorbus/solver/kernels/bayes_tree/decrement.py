@@ -29,7 +29,6 @@ from factorbus.solver.kernels.model.many import linearize_kept
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
-
 DIRECTIONS = 6  # at most: on old R the first are along what R, and not Λ, hardly holds
 
 
