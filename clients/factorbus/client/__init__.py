@@ -8,6 +8,7 @@
 """
 
 from factorbus.client.aligning import Alignment, AmbiguousAlignment, NotAligned, align
+from factorbus.client.attaching import Attached, attach
 from factorbus.client.bus import Bus, connect
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
@@ -32,6 +33,7 @@ __all__ = [
     "AbsoluteFactors",
     "Alignment",
     "AmbiguousAlignment",
+    "Attached",
     "BadCamera",
     "BlendedPose",
     "Bus",
@@ -63,6 +65,7 @@ __all__ = [
     "Standstill",
     "Unavailable",
     "align",
+    "attach",
     "connect",
     "cut_samples",
     "initial_from_standstill",

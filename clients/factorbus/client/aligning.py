@@ -11,8 +11,9 @@ How that is judged stands in `alignment`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from factorbus.client.map import Map
 from factorbus.client.merging import CannotMerge, with_letters
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import name_of_kind
-from factorbus.proto.messages import Batch, Estimate, Factors
+from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import Problem
 from factorbus.proto.roles import pick_factors
 from factorbus.proto.symbols import format_symbol
@@ -112,11 +113,31 @@ def align(
     of_type("other", other, Map, "a Map")
     given = batch_of("candidates", candidates)
     named = of_type("letters", letters or {}, Mapping, 'a mapping of letters, such as {"x": "y"}')
-    kind = _kind_of(given)
-    known_here = _poses(here.ask_estimate(timeout_s=timeout_s), {}, kind)
-    known_there = _poses(other.ask_estimate(timeout_s=timeout_s), named, kind)
-    ends = [_ends(kind, pair, known_here, known_there) for group in given.factors for pair in group.keys.tolist()]
-    of_a, of_b = [known_here[a] for a, *_ in ends], [known_there[b] for _, b, _ in ends]
+    kind = kind_of_candidates(given)
+    sides = (
+        Side(here, _poses(here.ask_estimate(timeout_s=timeout_s).variables, {}, kind)),
+        Side(other, _poses(other.ask_estimate(timeout_s=timeout_s).variables, named, kind)),
+    )
+    return align_sides(*sides, given, timeout_s)
+
+
+class Side(NamedTuple):
+    """Poses in one frame.  poses: by the key that candidates have, the key in `map`, and the pose as a matrix."""
+
+    map: Map
+    poses: Mapping[int, tuple[int, F64]]
+
+
+def side_of(of: Map, variables: Sequence[Variables], kind: str) -> Side:
+    """Poses of a kind, under the keys that they have."""
+    return Side(of, _poses(variables, {}, kind))
+
+
+def align_sides(here: Side, there: Side, given: Batch, timeout_s: float | None) -> Alignment:
+    """Where the frame of `there` lies in that of `here`.  Raises as `align` does."""
+    kind = kind_of_candidates(given)
+    ends = [_ends(kind, pair, here.poses, there.poses) for group in given.factors for pair in group.keys.tolist()]
+    of_a, of_b = [here.poses[a] for a, *_ in ends], [there.poses[b] for _, b, _ in ends]
     z, noise = _measured(given, kind, np.array([turned for *_, turned in ends]))
     kept = _first_of_each(ends, z, noise)
     known = CandidatePoses(
@@ -124,14 +145,14 @@ def align(
         np.array([of_b[k][1] for k in kept]),
         z[kept],
         noise[kept],
-        _joint(here, [of_a[k][0] for k in kept], timeout_s),
-        _joint(other, [of_b[k][0] for k in kept], timeout_s),
+        _joint(here.map, [of_a[k][0] for k in kept], timeout_s),
+        _joint(there.map, [of_b[k][0] for k in kept], timeout_s),
         np.array([ends[k][:2] for k in kept]),
     )
     return _alignment(judge(known), given, np.array(kept))
 
 
-def _kind_of(given: Batch) -> str:
+def kind_of_candidates(given: Batch) -> str:
     """The kind of pose that the candidates are between.  Raises CannotMerge."""
     kinds = {name_of_kind(group.kind) for group in given.factors if group.keys.size}
     wanted = "relative poses alone, all between_se2 or all between_se3"
@@ -143,9 +164,9 @@ def _kind_of(given: Batch) -> str:
     return _BETWEEN[kinds.pop()]
 
 
-def _poses(of: Estimate, letters: Mapping[str, str], kind: str) -> dict[int, tuple[int, F64]]:
+def _poses(variables: Sequence[Variables], letters: Mapping[str, str], kind: str) -> dict[int, tuple[int, F64]]:
     """By new key: its own key, and the pose as a matrix."""
-    batch = Batch(of.variables)
+    batch = Batch(tuple(variables))
     renamed = with_letters(batch, letters) if letters else batch
     found: dict[int, tuple[int, F64]] = {}
     for group, new in zip(batch.variables, renamed.variables, strict=True):

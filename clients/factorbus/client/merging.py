@@ -227,22 +227,25 @@ def _relative(batch: Batch, absolute: str, roles: Roles) -> tuple[Batch, dict[st
         held["fixed"] = fixed
     factors = []
     for group in batch.factors:
-        stays = are_relative(group, roles) if FACTOR_KINDS[group.kind].is_linear else _stays(group)
+        stays = hold_in_any_frame(group, roles)
         if not stays.all():
             name = name_of_kind(group.kind)
             held[name] = held.get(name, 0) + int((~stays).sum())
         if stays.any():
             factors.append(pick_factors(group, stays))
-    if absolute == "refuse" and not _is_gauge(batch, held):
+    if absolute == "refuse" and not is_gauge(batch, held):
         raise AbsoluteFactors(held)
     return Batch(tuple(group._replace(fixed=False) for group in batch.variables), tuple(factors)), held
 
 
-def _stays(group: Factors) -> np.ndarray:
+def hold_in_any_frame(group: Factors, roles: Roles) -> np.ndarray:
+    """(n,), which say nothing of where in the map's frame their variables are."""
+    if FACTOR_KINDS[group.kind].is_linear:
+        return are_relative(group, roles)
     return np.full(len(group.keys), not FACTOR_KINDS[group.kind].is_absolute)
 
 
-def _is_gauge(batch: Batch, held: Mapping[str, int]) -> bool:
+def is_gauge(batch: Batch, held: Mapping[str, int]) -> bool:
     """Whether it is no more than what a map that knows nothing of the world needs to begin with."""
     if sum(held.values()) > 1:
         return False

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import click
 
+from factorbus.cli.commands.attaching import attach_command
 from factorbus.cli.commands.merging import merge_command
 from factorbus.cli.output.advice import advising_changes
 from factorbus.cli.output.console import document, table
@@ -29,6 +30,7 @@ def command() -> None:
     factorbus change fix warehouse x0
     factorbus change fork warehouse what-if
     factorbus change merge warehouse robot2 --letter x=y --anchor x5 y8 0,2,-1.57 --sigmas 0.1,0.1,0.05
+    factorbus change attach warehouse b matches.txt --sigmas 0.1,0.1,0.05
     factorbus change adopt warehouse
     """
 
@@ -215,6 +217,7 @@ def fork_command(address: MapAddress, new: str, as_json: bool) -> int:
 
 
 command.command("merge")(_changing(merge_command))
+command.command("attach")(_changing(attach_command))
 
 
 def _make(address: MapAddress, changes: Any, settle: bool, as_json: bool) -> int:

@@ -82,7 +82,7 @@ def merge_command(address: MapAddress, other: str, merging: MergeOptions, settle
     sigmas, file, found = merging.sigmas, merging.candidates, None
     if file is not None and (merging.anchors or merging.frame):
         raise click.UsageError("--align finds out what --anchor and --frame say; give one of them")
-    candidates = None if file is None else _candidates(file, sigmas)
+    candidates = None if file is None else read_candidates(file, sigmas)
     how: dict[str, Any] = {
         "letters": dict(_pair("--letter", each, "x=y") for each in merging.letters),
         "anchors": _draft(merging.anchors, sigmas) if merging.anchors else None,
@@ -130,7 +130,7 @@ def _show(merged: Any, found: Any, as_json: bool) -> None:
     table([*rows, ("its origin", where), ("χ²", f"{chi2:.6g}")], title=f"At revision {accepted.revision}")
 
 
-def _candidates(file: Path, sigmas: str | None) -> Any:
+def read_candidates(file: Path, sigmas: str | None) -> Any:
     """Of each line a relative pose.  Raises UsageError."""
     from factorbus.client import Draft
 
@@ -138,7 +138,7 @@ def _candidates(file: Path, sigmas: str | None) -> Any:
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as problem:
-        raise click.UsageError(f"--align {file}: {problem}; wanted a text file, a line for each candidate") from problem
+        raise click.UsageError(f"{file}: {problem}; wanted a text file, a line for each candidate") from problem
     for number, line in enumerate(text.splitlines(), 1):
         fields = line.partition("#")[0].split()
         if not fields:

@@ -28,6 +28,8 @@ MERGING = {
     "absolute_factors": "--absolute leave-out merges it without them, --absolute keep as it is, if both have one frame",
 }
 
+ATTACHING = {"absolute_factors": "--absolute leave-out attaches the part without them"}
+
 
 @contextmanager
 def advising(advice: Mapping[str, str]) -> Iterator[None]:

@@ -1,0 +1,204 @@
+"""A robot that begins in a frame of its own, in the map of the others, and is attached when enough candidates agree."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from naive.dense_factors import pose_matrix
+from two_maps import SEEN, Candidate, Drive, two_drives
+
+from factorbus.cli.output.exits import REFUSED
+from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, Map, attach, connect
+
+SIGMAS = SEEN["se2"].tolist()
+
+
+def drives(kind: str, seed: int, right: int, wrong: int, grouped: int = 0) -> tuple[Drive, Drive, list[Candidate]]:
+    return two_drives(kind, 60, (right, wrong), grouped, np.random.default_rng(seed))
+
+
+def drafted(kind: str, candidates: list[Candidate]) -> Draft:
+    draft = Draft()
+    for each in candidates:
+        draft.factor(f"between_{kind}", [f"x{each.a}", f"y{each.b}"], each.z, sigmas=SEEN[kind].tolist())
+    return draft
+
+
+def fill(into: Map, of: Drive, letter: str = "x") -> None:
+    for step in of.steps:
+        batch = step.batch()
+        names = {ord("x"): ord(letter)}
+        into.send(
+            batch._replace(
+                variables=tuple(g._replace(keys=renamed(g.keys, names)) for g in batch.variables),
+                factors=tuple(g._replace(keys=renamed(g.keys, names)) for g in batch.factors),
+            )
+        )
+    into.flush()
+
+
+def renamed(keys: np.ndarray, names: dict[int, int]) -> np.ndarray:
+    letters = np.array([names[letter] for letter in (keys >> 56).ravel().tolist()]).reshape(keys.shape)
+    return keys & (1 << 56) - 1 | letters << 56
+
+
+def how_far_off(hall: Map, one: Drive, other: Drive) -> float:
+    """The largest distance of any pose of the second robot from where it is, seen from where the first began."""
+    begin, dim = np.linalg.inv(one.truth[0]), one.truth.shape[1] - 1
+    places = [(begin @ T)[:dim, dim] for T in other.truth]
+    return max(float(np.linalg.norm(hall.estimate[f"y{n}"][:dim] - place)) for n, place in enumerate(places))
+
+
+@pytest.mark.parametrize("kind", ["se2", "se3"])
+@pytest.mark.parametrize("closures", ["trust", "test"])
+def test_a_robot_is_attached_when_enough_agree_and_not_before(endpoint: str, kind: str, closures: str) -> None:
+    one, other, candidates = drives(kind, 5, 10, 14)
+    name = f"hall-{kind}-{closures}"
+    with connect(endpoint, client="matcher", timeout_s=60) as bus:
+        bus.create(name, closures=closures)
+        with bus.map(name) as hall:
+            fill(hall, one)
+            fill(hall, other, "y")
+            before, came, joined = hall.estimate["y10"], 0, None
+            for came in range(2, len(candidates) + 1):
+                joined = attach(hall, "y", drafted(kind, candidates[:came]), settle=True)
+                if joined.accepted:
+                    break
+                assert joined.alignment.verdict in ("too_few", "ambiguous")
+                np.testing.assert_array_equal(hall.estimate["y10"], before)
+            assert joined is not None
+            assert joined.accepted is not None
+            assert joined.left_out == {"fixed": 1}
+            agree = [candidates[k] for k in joined.alignment.agree]
+            assert all(each.is_right for each in agree)
+            assert len(agree) >= 3
+            assert joined.accepted.report["chi2"] < 2.0 * hall.stats()["factors"]
+            assert how_far_off(hall, one, other) < 3.0
+            # The robot drives on in the frame of all.
+            hall.insert(
+                Draft()
+                .variable(kind, "y60")
+                .factor(f"between_{kind}", ["y59", "y60"], other_step(kind), sigmas=SEEN[kind])
+            )
+            with pytest.raises(CannotMerge, match="joined to the rest already, by between_"):
+                attach(hall, "y", drafted(kind, candidates))
+
+
+def other_step(kind: str) -> list[float]:
+    return [1.0, 0.0, 0.0] if kind == "se2" else [1.0, 0, 0, 0, 0, 0, 1.0]
+
+
+def test_what_a_robot_sends_meanwhile_goes_along(endpoint: str) -> None:
+    """The poses that come between the question and the insert are not among those that are brought over."""
+    one, other, candidates = drives("se2", 7, 10, 5)
+    with connect(endpoint, client="matcher", timeout_s=60) as bus, bus.map("hall-m") as hall:
+        fill(hall, one)
+        fill(hall, other, "y")
+        asked, graph = hall.graph, hall.graph()
+
+        def graph_of_before(timeout_s: float | None = None) -> object:
+            del timeout_s
+            last = graph.batch.variables
+            hall.insert(Draft().se2("y60").between_se2("y59", "y60", (1, 0, 0), sigmas=SIGMAS))
+            hall.graph = asked  # type: ignore[method-assign]
+            return graph if last else None
+
+        hall.graph = graph_of_before  # type: ignore[method-assign,assignment]
+        joined = attach(hall, "y", drafted("se2", candidates), settle=True)
+        assert joined.accepted is not None
+        ahead = pose_matrix(hall.estimate["y59"]) @ [1, 0, 1]
+        np.testing.assert_allclose(hall.estimate["y60"][:2], ahead[:2], atol=1e-3)
+        assert joined.accepted.report["chi2"] < 2.0 * hall.stats()["factors"]
+
+
+def test_what_knows_more_of_its_frame_is_refused_unless_that_may_go(endpoint: str) -> None:
+    one, other, candidates = drives("se2", 8, 10, 0)
+    with connect(endpoint, client="matcher", timeout_s=60) as bus, bus.map("hall-g") as hall:
+        fill(hall, one)
+        fill(hall, other, "y")
+        hall.insert(
+            Draft()
+            .position_se2("y5", (5, 0), sigmas=(1, 1))
+            .point2("m1")
+            .landmark_se2("y7", "m1", (2, 0.1), sigmas=(0.1, 0.1))
+        )
+        revision = hall.estimate.revision
+        with pytest.raises(AbsoluteFactors, match="1 fixed, 1 position_se2"):
+            attach(hall, "ym", drafted("se2", candidates))
+        for letters, said in (
+            ("z", "no variable with these letters; its letters are m, x, y"),
+            ("mxy", "with other letters"),
+            ("", "letters is empty"),
+        ):
+            with pytest.raises(CannotMerge, match=said):
+                attach(hall, letters, drafted("se2", candidates))
+        with pytest.raises(CannotMerge, match="joined to the rest already, by landmark_se2"):
+            attach(hall, "y", drafted("se2", candidates), absolute="leave_out")
+        with pytest.raises(CannotMerge, match="absolute is 'keep'"):
+            attach(hall, "ym", drafted("se2", candidates), absolute="keep")
+        assert hall.estimate.revision == revision
+        joined = attach(hall, "ym", drafted("se2", candidates), absolute="leave_out", settle=True)
+        assert joined.left_out == {"fixed": 1, "position_se2": 1}
+        seen = np.linalg.inv(pose_matrix(hall.estimate["y7"])) @ [*hall.estimate["m1"], 1]
+        np.testing.assert_allclose(seen[:2], [2, 0.1], atol=1e-3)
+        assert how_far_off(hall, one, other) < 3.0
+
+
+def test_a_part_that_a_weak_prior_holds_ends_where_a_merge_of_two_maps_does(endpoint: str) -> None:
+    one, other, candidates = drives("se2", 9, 8, 6)
+    with connect(endpoint, client="matcher", timeout_s=60) as bus:
+        with bus.map("hall-w") as hall:
+            fill(hall, one)
+            fill(hall, other, "y")
+            hall.insert(Draft().prior_se2("y0", (0, 0, 0), sigmas=(10, 10, 3)), changes=Changes().free("y0"))
+            joined = attach(hall, "y", drafted("se2", candidates), settle=True)
+            assert joined.left_out == {"prior_se2": 1}
+            attached = values_of(hall)
+        with bus.map("hall-v") as hall, bus.map("yard-v") as yard:
+            fill(hall, one)
+            fill(yard, other)
+            hall.merge(yard, anchors=joined.alignment.anchors(), letters={"x": "y"}, settle=True)
+            merged = values_of(hall)
+    assert attached.keys() == merged.keys()
+    for key, value in attached.items():
+        np.testing.assert_allclose(value, merged[key], atol=1e-5)
+
+
+def values_of(hall: Map) -> dict[int, np.ndarray]:
+    found: dict[int, np.ndarray] = {}
+    for group in hall.ask_estimate().variables:
+        assert group.values is not None
+        found |= dict(zip(group.keys.tolist(), group.values, strict=True))
+    return found
+
+
+def command(endpoint: str, *rest: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-P", "-m", "factorbus.cli", "change", "attach", "--connect", endpoint, *rest]
+    return subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_from_a_shell(endpoint: str, tmp_path: Path) -> None:
+    one, other, candidates = drives("se2", 6, 9, 9)
+    with connect(endpoint, client="matcher", timeout_s=60) as bus, bus.map("hall-s") as hall:
+        fill(hall, one)
+        fill(hall, other, "y")
+        lines = [f"x{c.a} y{c.b} {','.join(map(str, c.z))}" for c in candidates]
+        few, all_of_them = tmp_path / "few.txt", tmp_path / "all.txt"
+        few.write_text("\n".join(lines[:1]))
+        all_of_them.write_text("\n".join(lines))
+        sigmas = ("--sigmas", ",".join(map(str, SIGMAS)))
+        told = command(endpoint, "hall-s", "y", str(few), *sigmas)
+        assert told.returncode == REFUSED
+        assert "not_aligned" in told.stderr
+        told = command(endpoint, "hall-s", "y", str(all_of_them), *sigmas, "--settle", "--json")
+        assert told.returncode == 0, told.stderr
+        found = json.loads(told.stdout)
+        assert (found["alignment"], found["left_out_fixed"]) == ("aligned", 1)
+        hall.settle()
+        assert how_far_off(hall, one, other) < 3.0
+        again = command(endpoint, "hall-s", "y", str(all_of_them), *sigmas)
+        assert again.returncode == REFUSED
+        assert "cannot_merge" in again.stderr
