@@ -20,7 +20,7 @@ help: ## this list
 setup: $(READY_DEV) ## virtual environment, the project with all its extras; CHOLMOD where it can be compiled
 
 $(READY): pyproject.toml $(SETUP)
-	@bash deploy/setup/environment.sh $(VENV) service,viz,gateway
+	@bash deploy/setup/environment.sh $(VENV) service,viz,gateway,ros2
 	@touch $@
 
 # bench: other libraries to compare with, which the tests have as oracles.
