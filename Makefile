@@ -20,7 +20,7 @@ help: ## this list
 setup: $(READY_DEV) ## virtual environment, the project with all its extras; CHOLMOD where it can be compiled
 
 $(READY): pyproject.toml $(SETUP)
-	@bash deploy/setup/environment.sh $(VENV) service,viz,gateway
+	@bash deploy/setup/environment.sh $(VENV) service,viz,gateway,ros2
 	@touch $@
 
 # bench: other libraries to compare with, which the tests have as oracles.
@@ -100,6 +100,7 @@ pictures: $(READY_DEV) ## draw the pictures of the README and the site again
 	@$(BIN)/factorbus simulate manhattan --poses 800 --seed 7 --out $(BIN)/../town.g2o
 	@$(BIN)/factorbus plot map $(BIN)/../town.g2o --solve --ellipses 40 --out docs/figures/town-map.png
 	@for what in sparsity tree drive; do $(BIN)/factorbus plot $$what $(BIN)/../town.g2o --out docs/figures/town-$$what.png; done
+	@bash docs/notebooks/pictures.sh $(BIN)
 	@$(BIN)/factorbus demo monocular --frames 120 --points 200 --plot docs/figures/rays.png
 
 wheel: $(READY_DEV) ## build the wheel and try it in a clean virtual environment

@@ -104,13 +104,19 @@ def test_every_block_runs_as_it_stands(document: str, tmp_path: Path) -> None:
     walk(document, tmp_path)
 
 
-def test_the_notebooks_run_from_top_to_bottom(tmp_path: Path) -> None:
+def test_the_notebooks_run_print_what_they_say_and_draw_their_pictures(tmp_path: Path) -> None:
     scripts = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
     assert len(scripts) >= 2
     with walker(tmp_path) as run:
         run("bash", "factorbus serve")
         for script in scripts:
-            assert run("bash", f"python '{script}'")
+            text = script.read_text(encoding="utf-8")
+            printed = re.findall(r"^# ```text\n((?:# .*\n)+?)# ```$", text, re.M)
+            assert len(printed) == len([cell for cell in re.split(r"^# %%", text, flags=re.M) if "print(" in cell])
+            agrees(re.sub(r"^# ", "", "".join(printed), flags=re.M), run("bash", f"python '{script}'"))
+            drawn = set(re.findall(r"savefig\(\"(.+?)\"", text))
+            assert drawn == set(re.findall(r"!\[.*\]\(\.\./figures/(.+)\)", text)) != set()
+            assert all((folder / name).exists() for name in drawn for folder in (tmp_path, ROOT / "docs" / "figures"))
 
 
 @pytest.mark.parametrize("peer", ["gtsam", "g2o"])

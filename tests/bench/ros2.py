@@ -8,9 +8,9 @@ from that to the transform is what the bridge adds to a step, and what the goal 
 
 The floor has the same messages, of the same sizes, from robot to relay, relay to hub (a query), hub to all (a
 publication) and relay to robot, with nothing done at any of them. Both run all the time and are asked in turn, BLOCK
-exchanges each.
+exchanges each. The pose with its covariance, which the bridge asks the service for, is waited for as well.
 
-Goal: p50 from the step's delta to the transform at most 5 ms.
+Goal: p50 from the step's delta to the transform, and to the pose with its covariance, at most 5 ms.
 """
 
 import argparse
@@ -22,7 +22,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,11 +47,13 @@ RELAY = "floor/ros2"
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Milliseconds from the odometry, and from the delta of its step, to the transform; of these the solver's."""
+    """Milliseconds from the odometry, and from the delta of its step, to the transform; of these the solver's; and
+    from that delta to the pose with its covariance."""
 
     total: float
     after_step: float
     solver: float
+    pose: float = 0.0
 
 
 class Robot:
@@ -64,10 +66,13 @@ class Robot:
         self._ros, self._words, self._bus = ros, words, bus
         self._node = ros.RosNode(bus, DOMAIN)
         self._came: queue.SimpleQueue[tuple[str, float, bytes]] = queue.SimpleQueue()
+        self._poses: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
         self._where, self._ns = (0.0, 0.0, 0.0), 10**9
         self.sizes: dict[str, int] = {}
         for word, key in (("delta", keys.delta_key(MAP)), ("tf", ros.topic_key(DOMAIN, "/tf", words.TFMessage))):
             bus.declare_subscriber(key, Callback(self._hear(word), indirect=False))
+        pose = ros.topic_key(DOMAIN, "/factorbus/pose", words.PoseWithCovarianceStamped)
+        bus.declare_subscriber(pose, Callback(self._hear_pose, indirect=False))
         self._node.wait_for_endpoints(8)
 
     def exchange(self) -> Sample:
@@ -81,7 +86,16 @@ class Robot:
             came["tf"] = self._wait_for("tf")
         self.sizes = {"odometry": len(message.serialize()), **{word: len(data) for word, (_, data) in came.items()}}
         solver = codec.decode_delta(came["delta"][1]).report["solver_ms"]
-        return _sample(start, came["delta"][0], came["tf"][0], solver)
+        pose = self._wait_for_pose()
+        return replace(_sample(start, came["delta"][0], came["tf"][0], solver), pose=1e3 * (pose - came["delta"][0]))
+
+    def _wait_for_pose(self) -> float:
+        """When that of the last odometry came; those of further steps may come before it."""
+        while True:
+            at, data = self._poses.get(timeout=30)
+            stamp = self._words.PoseWithCovarianceStamped.deserialize(data).header.stamp
+            if stamp.sec * 10**9 + stamp.nanosec >= self._ns:
+                return at
 
     def _wait(self) -> dict[str, tuple[float, bytes]]:
         """The delta and a transform, in whichever order."""
@@ -100,6 +114,9 @@ class Robot:
     def _stamp(self, data: bytes) -> int:
         stamp = self._words.TFMessage.deserialize(data).transforms[0].header.stamp
         return stamp.sec * 10**9 + stamp.nanosec
+
+    def _hear_pose(self, sample: zenoh.Sample) -> None:
+        self._poses.put((time.perf_counter(), sample.payload.to_bytes()))
 
     def _hear(self, word: str) -> Callable[[zenoh.Sample], None]:
         return lambda sample: self._came.put((word, time.perf_counter(), sample.payload.to_bytes()))
@@ -193,6 +210,7 @@ def _result(sizes: dict[str, int], ours: list[Sample], floor: list[Sample]) -> d
         "bytes": sizes,
         "after_step_ms": _rounded(after),
         "after_step_floor_ms": _rounded(bare_after),
+        "pose_ms": _rounded(np.array([s.pose for s in ours])),
         "odometry_to_transform_ms": _rounded(np.array([s.total for s in ours])),
         "without_solver_ms": _rounded(bus),
         "floor_ms": _rounded(bare),
@@ -220,18 +238,19 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         f"an odometry that is a keyframe ({size['odometry']} B) until its transform ({size['tf']} B) is back; "
         f"{result['samples']} samples, ms",
-        f"{'':32}{'p50':>9}{'p90':>9}{'p99':>9}",
+        f"{'':38}{'p50':>9}{'p90':>9}{'p99':>9}",
     ]
     for what, row in (
         ("from the step to the transform", "after_step_ms"),
         ("the same over bare Zenoh", "after_step_floor_ms"),
+        ("from the step to pose and covariance", "pose_ms"),
         ("from odometry to the transform", "odometry_to_transform_ms"),
         ("of that the solver", "solver_ms"),
         ("the rest", "without_solver_ms"),
         ("the same over bare Zenoh", "floor_ms"),
         ("ratio of the rest", "ratio"),
     ):
-        lines.append(f"{what:32}" + "".join(f"{result[row][p]:9.2f}" for p in ("p50", "p90", "p99")))
+        lines.append(f"{what:38}" + "".join(f"{result[row][p]:9.2f}" for p in ("p50", "p90", "p99")))
     return "\n".join([*lines, f"goal: from the step, p50, at most {GOAL_MS:g} ms; load {result['load']:.1f}"])
 
 
@@ -248,7 +267,7 @@ def main() -> int:
         return 0
     result = run(options.rounds, options.samples)
     print(json.dumps(result) if options.json else table(result))
-    return 0 if result["after_step_ms"]["p50"] <= GOAL_MS else 1
+    return 0 if max(result["after_step_ms"]["p50"], result["pose_ms"]["p50"]) <= GOAL_MS else 1
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""A robot on ROS 2 and a map of ours, joined: messages in on one thread, the correction out on the mirror's, pictures
-on a third."""
+"""A robot on ROS 2 and a map of ours, joined: messages in on one thread, the correction out on the mirror's, the pose
+with its covariance, which is asked for, on a third, and pictures on a fourth."""
 
 import logging
 import queue
@@ -30,8 +30,8 @@ log = logging.getLogger("factorbus.ros2")
 # Messages that may wait to be read; the next ones are dropped and counted.  Odometry is absolute, so little is lost.
 _BACKLOG = 4096
 _IDLE_S = 0.2
-# Drawing may take this share of the time.
-_DRAWING = 0.05
+# Drawing may take this share of the time, and asking how certain the pose is that.
+_DRAWING, _ASKING = 0.05, 0.5
 _OTHER_MAP = ("wrong_epoch", "unknown_map")
 _STATIC_DEPTH = 100  # transforms that each publisher of them keeps for those who come late
 _REMARKS = 1000  # different ones that are logged
@@ -50,6 +50,7 @@ class Bridge:
         self._remarked: set[tuple[str, str]] = set()
         self._front_end = FrontEnd(settings, *self._place_in_map())
         self._smoothed = SmoothedCorrection(settings.smooth_s)
+        self._stepped = threading.Event()  # since the last pose was published
         self._correcting = threading.Lock()  # of two threads none publishes by an older estimate than the other
         self._transforms = node.publisher(self._topic(settings.transforms, TRANSFORMS, 100))
         self._raw_transforms = (
@@ -68,8 +69,12 @@ class Bridge:
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop`.  Raises what the map refuses in a way that nothing here can mend."""
-        drawing = threading.Thread(target=self._draw, args=(stop,), name="factorbus-ros2-display", daemon=True)
-        drawing.start()
+        beside = [
+            threading.Thread(target=work, args=(stop,), name=f"factorbus-ros2-{name}", daemon=True)
+            for name, work in (("pose", self._locate), ("display", self._draw))
+        ]
+        for each in beside:
+            each.start()
         try:
             while not stop.is_set():
                 try:
@@ -82,7 +87,8 @@ class Bridge:
         finally:
             self._forget()
             stop.set()
-            drawing.join()
+            for each in beside:
+                each.join()
 
     def _listen(self, node: Node, topic: Topic, kept: bool = False) -> None:
         def hear(data: bytes) -> None:
@@ -194,6 +200,7 @@ class Bridge:
     def _on_delta(self, _: Delta) -> None:
         """On the mirror's thread, after a step."""
         self._correct()
+        self._stepped.set()
 
     def _correct(self) -> None:
         mirror = self._map.estimate
@@ -228,9 +235,18 @@ class Bridge:
             start, snapshot, stamp_ns = time.perf_counter(), mirror.snapshot(), self._front_end.stamp_ns
             self._path.publish(display.path(self._messages, self._settings, snapshot, stamp_ns))
             self._markers.publish(display.markers(self._messages, self._settings, snapshot, stamp_ns))
-            self._publish_pose(snapshot)
             drawn = snapshot.epoch, snapshot.revision
             pause_s = max(self._settings.display_s, (time.perf_counter() - start) / _DRAWING)
+
+    def _locate(self, stop: threading.Event) -> None:
+        """The pose after every step, or after several where they come faster than answers."""
+        self._stepped.set()  # of what is there
+        while not stop.is_set():
+            if self._stepped.wait(_IDLE_S):
+                self._stepped.clear()
+                start = time.perf_counter()
+                self._publish_pose(self._map.estimate.snapshot())
+                stop.wait((time.perf_counter() - start) * (1 / _ASKING - 1))
 
     def _publish_pose(self, snapshot: Snapshot) -> None:
         """The last keyframe, with the covariance that the service has of it by now."""

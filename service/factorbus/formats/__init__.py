@@ -1,11 +1,12 @@
-"""Graph files in and out: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL and TUM text and GLIM's maps are read,
-g2o, PyFactorGraph, JRL, TUM and KITTI are written.
+"""Graph files in and out: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL and TUM text, GLIM's maps and the poses of
+COLMAP's models are read, g2o, PyFactorGraph, JRL, TUM and KITTI are written.
 
 `read` gives a `GraphFile`: the whole graph as one `Batch`, and its replay as one `Batch` a pose, in time order.
 """
 
 from factorbus.formats.errors import FormatError
 from factorbus.formats.graph import GraphFile
+from factorbus.formats.loop_list import with_loops
 from factorbus.formats.numbering import IDS
 from factorbus.formats.read_glim import is_glim
 from factorbus.formats.reader import READS, read
@@ -40,6 +41,7 @@ __all__ = [
     "recoded",
     "tum_notes",
     "tum_text",
+    "with_loops",
     "write_g2o",
     "write_graph",
     "write_jrl",

@@ -21,6 +21,7 @@ from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.pyfg import PYFG
 from factorbus.formats.ranging import lone_ranges
 from factorbus.formats.read_bal import BAL, is_bal, read_bal
+from factorbus.formats.read_colmap import COLMAP, is_colmap, read_colmap
 from factorbus.formats.read_glim import GLIM, is_glim, read_glim
 from factorbus.formats.read_jrl import is_jrl, read_jrl
 from factorbus.formats.read_pyfg import is_pyfg, read_pyfg
@@ -34,7 +35,7 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol_parts
 from factorbus.wording import counted
 
-READS = (*DIALECTS, PYFG, JRL, TUM, BAL, GLIM)
+READS = (*DIALECTS, PYFG, JRL, TUM, BAL, GLIM, COLMAP)
 _NAMED = (PYFG, JRL, GLIM)  # forms whose keys are symbols, and not ids
 
 # A prior of a point that names a pose is one of its position: RTAB-Map writes them so.
@@ -47,11 +48,11 @@ def read(
     path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False, whole: bool = False
 ) -> GraphFile:
     """The graph in `path`: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, BAL or TUM text, plain or gzipped, or the
-    folder of a map that GLIM has saved.
+    folder of a map that GLIM has saved, or of a COLMAP model.
 
-    dialect: "g2o", "toro", "isam", "slam++", "pyfg", "jrl", "bal", "tum" or "glim"; without it the names of the records
-    decide, and the ending where they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and
-    no factors.  BAL is cameras, their lenses and points, all in one step (`read_bal`).  GLIM: `read_glim`.
+    dialect: one of READS; without it the names of the records decide, and the ending where they do not; a guess is in
+    the notes.  TUM and COLMAP are trajectories: poses with time stamps, and no factors.  BAL is cameras, their lenses
+    and points, all in one step (`read_bal`).  GLIM: `read_glim`.
     Keys are symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols
     and time stamps are, all keys are the ids themselves; of pyfg they are its names, A12 is symbol("A", 12).  JRL
     is JSON: its keys are symbols, what it says beside the graph is `log`, and errors name the place in place of a line.
@@ -68,6 +69,8 @@ def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFi
     if dialect == GLIM or (dialect is None and is_glim(path)):
         left = LeftOut(file, strict, whole)
         return _graph(file, GLIM, *read_glim(path, left), left, "ids")
+    if dialect == COLMAP or (dialect is None and is_colmap(path)):
+        return read_colmap(path)
     content = read_content(path)
     if dialect == JRL or (dialect is None and (is_jrl(content) or path.suffix.lower() == f".{JRL}")):
         left = LeftOut(file, strict, whole)

@@ -41,7 +41,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
     idp        inverse-depth features: the 2011 paper's tables and figures with our column, seconds, workers;
                --figures FOLDER, --no-workers
-    ros2       a robot's odometry with its transform back through `factorbus ros2`, against bare Zenoh
+    ros2       a robot's odometry with its transform and its pose back through `factorbus ros2`, against bare Zenoh
     ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
                of 10,000 candidates; --quick
     batch      whole graphs from file values and from odometry to the optimum, beside GTSAM and g2o: public data sets,

@@ -2,7 +2,7 @@
 
 import click
 
-from factorbus.cli.process.options import connect_option, timeout_option, zenoh_option
+from factorbus.cli.process.options import connect_option, json_option, timeout_option, zenoh_option
 
 
 # What begins with a minus is a number here, to be refused as one.
@@ -12,7 +12,8 @@ from factorbus.cli.process.options import connect_option, timeout_option, zenoh_
 @connect_option
 @zenoh_option
 @timeout_option(30)
-def command(name: str, budget: str, endpoint: str, zenoh: str, timeout_s: float) -> None:
+@json_option
+def command(name: str, budget: str, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> None:
     """Give the steps of MAP a budget of MS milliseconds, from the next one on; none takes it away.
 
     What does not fit into a step follows in later ones. Without a budget the next step does all that was left. The
@@ -24,11 +25,15 @@ def command(name: str, budget: str, endpoint: str, zenoh: str, timeout_s: float)
     factorbus budget yard none
     factorbus budget yard 2.5 --connect tls/router.local:7447 --zenoh ops.json5
     """
+    from factorbus.cli.output.console import document
     from factorbus.cli.process.bus import open_bus
 
     budget_ms = _read(budget)
     with open_bus(endpoint, "budget", zenoh, timeout_s) as bus:
         row = bus.set_budget(name, budget_ms)
+    if as_json:
+        document({"map": name, "budget_ms": row.budget_ms or None})
+        return
     click.echo(f"steps of {name} have " + (f"a budget of {row.budget_ms:g} ms" if row.budget_ms else "no bound"))
 
 

@@ -1,12 +1,13 @@
 """`factorbus convert`: from one file format to another."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from factorbus.cli.output.exits import output_file
-from factorbus.cli.process.options import file_argument, json_option
+from factorbus.cli.process.options import file_argument, grouped, json_option
 from factorbus.cli.process.reading import (
     COUNTED,
     GRAPHS,
@@ -25,7 +26,18 @@ if TYPE_CHECKING:
 _WRITES = (*GRAPHS, ".tum", ".kitti")
 
 
+@dataclass(frozen=True, slots=True)
+class ConvertOptions:
+    """What else is read, and what is written: see the options of these names."""
+
+    robot: str | None
+    ids: str | None
+    ground_truth: bool
+    loops: Path | None
+
+
 @click.command()
+@grouped("options", ConvertOptions)
 @file_argument("source")
 @file_argument("target")
 @reading_options
@@ -37,23 +49,23 @@ _WRITES = (*GRAPHS, ".tum", ".kitti")
     "[default: auto]",
 )
 @click.option("--ground-truth", is_flag=True, help="Write the ground truth of a .jrl in place of its values.")
+@click.option(
+    "--loops", type=click.Path(path_type=Path), metavar="FILE",
+    help="Of a SOURCE that is a trajectory: loop closures, lines of first second tx ty tz qx qy qz qw [sigma_m "
+    "sigma_rad], poses by their place (0 1 2 ...) or time.",
+)  # fmt: skip
 @json_option
 def command(
-    source: Path,
-    target: Path,
-    dialect: str | None,
-    strict: bool,
-    robot: str | None,
-    ids: str | None,
-    ground_truth: bool,
-    as_json: bool,
+    source: Path, target: Path, dialect: str | None, strict: bool, options: ConvertOptions, as_json: bool
 ) -> None:
-    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg, JRL .jrl or .jrl.cbor, BAL or TUM text, or the
-    folder of a map that GLIM has saved) and write TARGET (.g2o, .pyfg, .jrl, .jrl.cbor, .tum or .kitti, by its ending).
+    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg, JRL .jrl or .jrl.cbor, BAL or TUM text, the
+    folder of a map that GLIM has saved, or of a COLMAP model) and write TARGET (.g2o, .pyfg, .jrl, .jrl.cbor, .tum or
+    .kitti, by its ending).
 
     What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
     letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum. A .tum has each pose's time stamp.
-    With --ground-truth it is where the poses really were, which a .jrl may say.
+    With --ground-truth it is where the poses really were, which a .jrl may say.  With --loops a trajectory becomes a
+    graph: odometry between its poses, with 2 % of the way as its error, and the closures.
 
     \b
     factorbus convert w10000.graph w10000.g2o
@@ -63,18 +75,23 @@ def command(
     factorbus convert ntu.jrl ntu.jrl.cbor
     factorbus convert two-robots.g2o a.tum --robot a
     factorbus convert dump map.g2o
+    factorbus convert sparse/0 cameras.tum
+    factorbus convert way.tum way.g2o --loops loops.txt
     factorbus convert edges.txt edges.g2o --dialect slam++
     """
     if target.suffix not in _WRITES:
         raise click.BadParameter(
             f"{target} does not end in {' or '.join((', '.join(_WRITES[:-1]), _WRITES[-1]))}", param_hint="TARGET"
         )
+    robot, ids, ground_truth = options.robot, options.ids, options.ground_truth
     check_chosen(target, robot, ids)
     if ground_truth and target.suffix in GRAPHS:
         raise click.UsageError(f"--ground-truth is of trajectories: a {target.suffix} has the whole graph")
     from factorbus.cli.output.console import document, print_note
 
     graph = read_graph(source, dialect, strict, whole=True)
+    if options.loops is not None:
+        graph = _with_loops(graph, options.loops)
     graph = _of_truth(graph) if ground_truth else graph
     _check_any(graph, target)
     with output_file(target):
@@ -85,6 +102,15 @@ def command(
         document({**about, "notes": list(notes), **counts})
     told = ", ".join(counted(counts[many], one) for many, one in COUNTED)
     print_note(f"{', '.join(map(str, files))}: {told}")
+
+
+def _with_loops(graph: "GraphFile", loops: Path) -> "GraphFile":
+    """What was assumed is said.  Raises FormatError."""
+    from factorbus.formats import with_loops
+
+    joined = with_loops(graph, loops)
+    say(Path(graph.path), joined.notes[len(graph.notes) :])
+    return joined
 
 
 def _of_truth(graph: "GraphFile") -> "GraphFile":

@@ -2,7 +2,7 @@
 
 import click
 
-from factorbus.cli.process.options import connect_option, timeout_option, zenoh_option
+from factorbus.cli.process.options import connect_option, json_option, timeout_option, zenoh_option
 
 
 @click.command()
@@ -21,7 +21,10 @@ from factorbus.cli.process.options import connect_option, timeout_option, zenoh_
 @connect_option
 @zenoh_option
 @timeout_option(30)
-def command(name: str, revision: int | None, damaged: bool, endpoint: str, zenoh: str, timeout_s: float) -> None:
+@json_option
+def command(
+    name: str, revision: int | None, damaged: bool, endpoint: str, zenoh: str, timeout_s: float, as_json: bool
+) -> None:
     """Drop MAP, with its journal. With --revision it stays when somebody inserted meanwhile: `moved_on`, exit code 5.
 
     The last step of moving a map: what was copied is all there is. Where access control is on, ask as an operator.
@@ -34,8 +37,12 @@ def command(name: str, revision: int | None, damaged: bool, endpoint: str, zenoh
     factorbus drop hall --damaged
     factorbus drop shard0-hall --revision 4711 --connect tls/router.local:7447 --zenoh ops.json5
     """
+    from factorbus.cli.output.console import document
     from factorbus.cli.process.bus import open_bus
 
     with open_bus(endpoint, "drop", zenoh, timeout_s) as bus:
         bus.drop(name, revision=revision, damaged=damaged)
-    click.echo(f"{name} is gone")
+    if as_json:
+        document({"map": name, "dropped": True})
+    else:
+        click.echo(f"{name} is gone")

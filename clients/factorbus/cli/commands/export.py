@@ -1,10 +1,11 @@
 """`factorbus export`: a map as one file, or all maps of a journal."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from factorbus.cli.process.options import journal_option
+from factorbus.cli.process.options import journal_option, json_option
 from factorbus.proto.keys import checked_name
 
 
@@ -20,7 +21,8 @@ from factorbus.proto.keys import checked_name
     metavar="PATH",
     help="The file, or with --all the folder.  [default: MAP.fbmap here; here]",
 )
-def command(name: str | None, folder: Path, every_map: bool, out: Path | None) -> None:
+@json_option
+def command(name: str | None, folder: Path, every_map: bool, out: Path | None, as_json: bool) -> int:
     """Copy MAP out of a service's journal into one file: every insert, clients' places, the newest checkpoint.
 
     Also while the service is at work: the file has the map as it was at one moment; its revision is printed. To move a
@@ -35,7 +37,8 @@ def command(name: str | None, folder: Path, every_map: bool, out: Path | None) -
     factorbus export warehouse --journal /var/lib/factorbus --out /backup/warehouse-monday.fbmap
     factorbus export --all --journal /var/lib/factorbus --out /backup/monday
     """
-    from factorbus.cli.output.exits import Stopped
+    from factorbus.cli.output.console import document
+    from factorbus.cli.output.exits import FAILED, OK, Stopped
 
     if every_map == (name is not None):
         raise click.UsageError("name a MAP, or say --all")
@@ -44,22 +47,29 @@ def command(name: str | None, folder: Path, every_map: bool, out: Path | None) -
     if out is not None and out.exists() and out.is_dir() != every_map:
         raise click.UsageError(f"{out} is {'a folder; wanted a file' if out.is_dir() else 'a file; wanted a folder'}")
     if name is not None:
-        _export(folder, checked_name("map", name), out or Path(f"{name}.fbmap"))
-        return
-    failed = _export_all(folder, out or Path())
+        rows = [_export(folder, checked_name("map", name), out or Path(f"{name}.fbmap"), as_json)]
+    else:
+        rows = _export_all(folder, out or Path(), as_json)
+    failed = [row["map"] for row in rows if "problem" in row]
+    if as_json:
+        document({"maps": rows})
+        return FAILED if failed else OK
     if failed:
         raise Stopped("not_all_exported", f"not copied: {', '.join(failed)}; what is wrong is said above", maps=failed)
+    return OK
 
 
-def _export(folder: Path, name: str, file: Path) -> None:
+def _export(folder: Path, name: str, file: Path, as_json: bool) -> dict[str, Any]:
     from factorbus.journal.bundle import export_map
 
-    revision = export_map(folder / name, file)
-    click.echo(f"{file}: revision {revision}, {file.stat().st_size / 1e6:.1f} MB")
+    revision, size = export_map(folder / name, file), file.stat().st_size
+    if not as_json:
+        click.echo(f"{file}: revision {revision}, {size / 1e6:.1f} MB")
+    return {"map": name, "file": str(file), "revision": revision, "bytes": size}
 
 
-def _export_all(folder: Path, out: Path) -> list[str]:
-    """The names of those that could not be."""
+def _export_all(folder: Path, out: Path, as_json: bool) -> list[dict[str, Any]]:
+    """A row for each map; of one that could not be copied it has the problem."""
     from factorbus.cli.output.console import print_note
     from factorbus.journal.folders import maps_in
     from factorbus.journal.problems import NoJournal
@@ -69,11 +79,11 @@ def _export_all(folder: Path, out: Path) -> list[str]:
     if not folder.is_dir():
         raise NoJournal(folder)
     out.mkdir(parents=True, exist_ok=True)
-    failed = []
+    rows = []
     for name in maps_in(folder, NAME):
         try:
-            _export(folder, name, out / f"{name}.fbmap")
+            rows.append(_export(folder, name, out / f"{name}.fbmap", as_json))
         except Problem as problem:
-            failed.append(name)
+            rows.append({"map": name, "problem": {"code": problem.code, "message": problem.message}})
             print_note(f"{name}: {problem}")
-    return failed
+    return rows

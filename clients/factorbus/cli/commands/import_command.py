@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from factorbus.cli.process.options import journal_option
+from factorbus.cli.process.options import journal_option, json_option
 from factorbus.proto.keys import checked_name
 
 
@@ -12,7 +12,8 @@ from factorbus.proto.keys import checked_name
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @journal_option
 @click.option("--as", "name", metavar="MAP", help="Its name here, of one FILE.  [default: that of the file]")
-def command(files: tuple[Path, ...], folder: Path, name: str | None) -> None:
+@json_option
+def command(files: tuple[Path, ...], folder: Path, name: str | None, as_json: bool) -> None:
     """Put the maps that `factorbus export` wrote to FILE, ... into a service's journal.
 
     Each is checked first, and is there whole or not at all. A service that is at work lists it, and opens it when
@@ -24,10 +25,16 @@ def command(files: tuple[Path, ...], folder: Path, name: str | None) -> None:
     factorbus import /backup/warehouse-monday.fbmap --journal /var/lib/factorbus --as warehouse-restored
     factorbus import /backup/monday/*.fbmap --journal /var/lib/factorbus
     """
+    from factorbus.cli.output.console import document
     from factorbus.journal.bundle import import_map
 
     if name and len(files) > 1:
         raise click.UsageError("--as is for one FILE")
+    rows = []
     for file, chosen in [(file, checked_name("map", name or file.stem)) for file in files]:
         import_map(file, folder / chosen)
-        click.echo(f"{folder / chosen}")
+        rows.append({"map": chosen, "file": str(file), "folder": str(folder / chosen)})
+        if not as_json:
+            click.echo(f"{folder / chosen}")
+    if as_json:
+        document({"maps": rows})

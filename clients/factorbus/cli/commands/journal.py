@@ -74,18 +74,19 @@ def _row(store: Any) -> dict[str, Any]:
 @command.command()
 @_MAP
 @journal_option
-def check(names: tuple[str, ...], folder: Path) -> int:
+@json_option
+def check(names: tuple[str, ...], folder: Path, as_json: bool) -> int:
     """Is it sound: the database, every insert's bytes, every client's numbers, every checkpoint? Exit code 1: no."""
-    sound = True
-    for name in _names(folder, names):
-        wrong = list(_wrong_with(folder / name))
+    found = {name: list(_wrong_with(folder / name)) for name in _names(folder, names)}
+    if as_json:
+        screen.document({"maps": [{"map": name, "sound": not wrong, "wrong": wrong} for name, wrong in found.items()]})
+    for name, wrong in () if as_json else found.items():
         click.echo(f"{name}: {'sound' if not wrong else 'NOT SOUND'}")
         for each in wrong:
             click.echo(f"  {each}")
         if wrong:
             click.echo(f"  {_NEXT.format(name=name)}")
-        sound = sound and not wrong
-    return OK if sound else FAILED
+    return FAILED if any(found.values()) else OK
 
 
 def _wrong_with(folder: Path) -> Iterator[str]:
@@ -108,7 +109,8 @@ def _wrong_with(folder: Path) -> Iterator[str]:
 @command.command()
 @_MAP
 @journal_option
-def verify(names: tuple[str, ...], folder: Path) -> int:
+@json_option
+def verify(names: tuple[str, ...], folder: Path, as_json: bool) -> int:
     """Apply everything again, from the first insert on: is every revision the same, to the bit? Exit code 1: no.
 
     Another processor, or another version of factorbus, may well round otherwise: then the first revision is named at
@@ -117,19 +119,34 @@ def verify(names: tuple[str, ...], folder: Path) -> int:
     require("service", "factorbus journal verify")
     from factorbus.proto.problems import Problem
 
-    alike, code = True, OK
+    rows, code = list[dict[str, Any]](), OK
     for name in _names(folder, names):
         try:
             with _open(folder / name) as store:
-                alike = _verified(name, store) and alike
+                rows.append({"map": name, **_verified(name, store)})
         except Problem as problem:
-            click.echo(f"{name}: cannot be verified")
+            rows.append({"map": name, "code": problem.code, "problem": problem.message})
             code = report(problem, as_json=False, debug=False)
-    return code or (OK if alike else FAILED)
+        if not as_json:
+            click.echo(_told(rows[-1]))
+    if as_json:
+        screen.document({"maps": rows})
+    return code or (FAILED if any(row.get("differs_from") for row in rows) else OK)
 
 
-def _verified(name: str, store: Any) -> bool:
-    """Whether it gives the same to the bit, and say so.  Raises JournalDamaged, JournalDiffers, JournalOption."""
+def _told(row: dict[str, Any]) -> str:
+    name = row["map"]
+    if "code" in row:
+        return f"{name}: cannot be verified"
+    if row["differs_from"] is not None:
+        return f"{name}: values differ from revision {row['differs_from']} on (of {row['revision']})"
+    return (
+        f"{name}: {counted(row['records'], 'record')}, {counted(row['revision'], 'revision')}, all the same to the bit"
+    )
+
+
+def _verified(name: str, store: Any) -> dict[str, Any]:
+    """From which revision on it differs, if any.  Raises JournalDamaged, JournalDiffers, JournalOption."""
     from factorbus.service.config import Limits
     from factorbus.service.journal.library import make_map_solver
     from factorbus.service.journal.recovery import verify as run_again
@@ -142,11 +159,7 @@ def _verified(name: str, store: Any) -> bool:
             revision = record.revision
             differs = differs or (0 if same else revision)
             show_progress(record.number, f"revision {revision}")
-    if differs:
-        click.echo(f"{name}: values differ from revision {differs} on (of {revision})")
-    else:
-        click.echo(f"{name}: {counted(total, 'record')}, {counted(revision, 'revision')}, all the same to the bit")
-    return not differs
+    return {"records": total, "revision": revision, "differs_from": differs or None}
 
 
 def _names(folder: Path, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from factorbus.cli.output.exits import require
 from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
 from factorbus.cli.process.options import DEFAULT_ENDPOINT, SECONDS, grouped, zenoh_option
+from factorbus.cli.process.parameters_file import NodeCommand, params_file_option
 from factorbus.cli.process.robot_options import robot_options
 from factorbus.ros2.options import BridgeOptions
 
@@ -36,7 +37,7 @@ class NodeOptions:
     save_folder: Path | None
 
 
-@click.command()
+@click.command(cls=NodeCommand)
 @grouped("as_node", NodeOptions)
 @grouped("given", BridgeOptions)
 @click.argument("map_name", metavar="MAP")
@@ -79,6 +80,7 @@ class NodeOptions:
 @click.option(
     "--display", type=SECONDS, default=1.0, show_default=True, metavar="SECONDS", help="Least time between paths."
 )
+@params_file_option
 @zenoh_option
 @log_option
 @click.option("--quiet", is_flag=True, help="Log warnings only.")
@@ -104,6 +106,7 @@ def command(
     factorbus ros2 warehouse
     factorbus ros2 warehouse --ros tcp/robot1.local:7447 --domain 7 --odom /robot1/odom --letter a
     factorbus ros2 yard --space --landmarks /tags --mount camera=0.2,0,0.3,-0.5,0.5,-0.5,0.5
+    factorbus ros2 yard --params-file robot1.yaml
 
     What is done with covariances, and more: deploy/ros2/README.md.
     """

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from factorbus.cli.output.exits import REFUSED, Stopped, output_file
-from factorbus.cli.process.options import checked_output, connect_option, timeout_option, zenoh_option
+from factorbus.cli.process.options import checked_output, connect_option, json_option, timeout_option, zenoh_option
 from factorbus.cli.process.reading import GRAPHS, IDS, ROBOT_LOGS, check_chosen
 
 if TYPE_CHECKING:
@@ -28,8 +28,16 @@ _WRITES = (*GRAPHS, ".tum", ".kitti")
 @connect_option
 @zenoh_option
 @timeout_option(60)
+@json_option
 def command(
-    name: str, target: Path, robot: str | None, ids: str | None, endpoint: str, zenoh: str, timeout_s: float
+    name: str,
+    target: Path,
+    robot: str | None,
+    ids: str | None,
+    endpoint: str,
+    zenoh: str,
+    timeout_s: float,
+    as_json: bool,
 ) -> None:
     """Write MAP as it is now into FILE: the whole graph as .g2o, .pyfg, .jrl or .jrl.cbor, or trajectories as .tum
     or .kitti, by its ending.
@@ -47,6 +55,7 @@ def command(
     if target.suffix not in _WRITES:
         raise click.BadParameter(f"{target} does not end in {', '.join(_WRITES)}", param_hint="FILE")
     check_chosen(target, robot, ids)
+    from factorbus.cli.output.console import document
     from factorbus.cli.process.bus import open_bus
     from factorbus.formats import recoded, write_whole
 
@@ -58,11 +67,16 @@ def command(
             if robots
             else {"": joined.export(form, ids=ids or "auto")}
         )
+    files = []
     for letter, text in texts.items():
         path = target if len(texts) == 1 else target.with_name(f"{target.stem}-{letter or 'none'}{target.suffix}")
         with output_file(path):
             write_whole(path, recoded(text) if path.suffix == ".cbor" else text)
-        click.echo(path)
+        files.append(str(path))
+        if not as_json:
+            click.echo(path)
+    if as_json:
+        document({"map": name, "files": files})
 
 
 def _robots(joined: "Map", robot: str | None) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import output_file
-from factorbus.cli.process.options import WORLDS, out_option
+from factorbus.cli.process.options import WORLDS, json_option, out_option
 from factorbus.wording import counted
 
 
@@ -23,7 +23,10 @@ from factorbus.wording import counted
     help="Of inertial, in place of --out: an EuRoC folder, which `replay` reads.",
 )
 @out_option("--truth", "truth", "Where it really was, in TUM form.", "FILE.tum")
-def command(world: str, poses: int, seed: int, out: Path | None, folder: Path | None, truth: Path | None) -> None:
+@json_option
+def command(
+    world: str, poses: int, seed: int, out: Path | None, folder: Path | None, truth: Path | None, as_json: bool
+) -> None:
     """Drive a robot through WORLD and write what it measured.
 
     \b
@@ -44,6 +47,8 @@ def command(world: str, poses: int, seed: int, out: Path | None, folder: Path | 
     """
     if world == "inertial":
         _inertial(poses, seed, out, folder, truth)
+        if as_json:
+            _document(world, poses, seed, [folder, truth])
         return
     if folder is not None:
         raise click.UsageError(f"--folder is of inertial; {world} is one file: --out FILE.g2o")
@@ -73,6 +78,14 @@ def command(world: str, poses: int, seed: int, out: Path | None, folder: Path | 
         with output_file(truth):
             write_tum(truth, merged(truths))
         screen.print_note(f"{truth}: {counted(poses, 'pose')}, as they are")
+    if as_json:
+        _document(world, poses, seed, [out, truth])
+
+
+def _document(world: str, poses: int, seed: int, files: list[Path | None]) -> None:
+    from factorbus.cli.output.console import document
+
+    document({"world": world, "poses": poses, "seed": seed, "files": [str(each) for each in files if each]})
 
 
 def _inertial(poses: int, seed: int, out: Path | None, folder: Path | None, truth: Path | None) -> None:
