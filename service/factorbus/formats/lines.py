@@ -18,8 +18,9 @@ class Bucket:
 
 
 def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
-    """The lines of `content` by record, in the order of the file; blank lines and what follows a # are left out.
+    """The lines of `content` by record, in the order of the file; blank lines and comments are left out.
 
+    A comment begins with a # that begins a word: 1.#INF, as some compilers print an infinity, is no 1.
     Raises FormatError when it is not text or has no record.
     """
     if b"\0" in content:
@@ -27,7 +28,7 @@ def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
         raise FormatError(file, line, "a zero byte", "a text file in ASCII or UTF-8")
     found: dict[bytes, Bucket] = {}
     for number, line in enumerate(content.split(b"\n"), 1):
-        name, *rest = line.partition(b"#")[0].split(None, 1) or (b"",)
+        name, *rest = _uncommented(line).split(None, 1) or (b"",)
         if not name:
             continue
         bucket = found.get(name)
@@ -38,6 +39,14 @@ def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
     if not found:
         raise FormatError(file, None, "no record at all", "lines such as EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1")
     return {name.decode("utf-8", "backslashreplace"): bucket for name, bucket in found.items()}
+
+
+def _uncommented(line: bytes) -> bytes:
+    """`line` up to its comment."""
+    at = line.find(b"#")
+    while at > 0 and not line[at - 1 : at].isspace():
+        at = line.find(b"#", at + 1)
+    return line if at < 0 else line[:at]
 
 
 def read_content(path: Path) -> bytes:
