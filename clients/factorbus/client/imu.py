@@ -54,7 +54,8 @@ class ImuNoise:
 
     def __post_init__(self) -> None:
         for field, value in zip(fields(self), astuple(self), strict=True):
-            number = float(as_numbers(f"ImuNoise: {field.name}", value, "a number").sum())
+            numbers = as_numbers(f"ImuNoise: {field.name}", value, "a number")
+            number = float(numbers.sum()) if numbers.size == 1 else np.nan
             if not (np.isfinite(number) and (number > 0.0 or (field.name == "integration" and number == 0.0))):
                 wanted = "0 or more" if field.name == "integration" else "a finite number above 0"
                 raise BadOption(f"ImuNoise: {field.name}", seen(value), wanted)
