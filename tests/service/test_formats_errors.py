@@ -1,6 +1,8 @@
 """Every way in which a file is wrong names the file, the line, what stands there and what was wanted."""
 
 import gzip
+import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -115,6 +117,23 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
         read(tmp_path / "nowhere.g2o")
     with pytest.raises(FormatError, match="cannot be read"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_pipe_is_read_whole(tmp_path: Path, packed: bool) -> None:
+    pipe = tmp_path / "pipe.g2o"
+    os.mkfifo(pipe)
+    content = gzip.compress(GOOD.encode()) if packed else GOOD.encode()
+    writer = threading.Thread(target=pipe.write_bytes, args=(content,), daemon=True)
+    writer.start()
+    assert read(pipe).batch.factor_count == 1
+    writer.join(10)
+
+
+@pytest.mark.parametrize("device", ["/dev/zero", "/dev/null"])
+def test_a_device_is_refused_and_not_read_for_ever(device: str) -> None:
+    with pytest.raises(FormatError, match=f"{device}: a device; wanted a file, or a pipe"):
+        read(device)
 
 
 def test_damaged_gzip(tmp_path: Path) -> None:

@@ -52,6 +52,8 @@ def _uncommented(line: bytes) -> bytes:
 def read_content(path: Path) -> bytes:
     """The bytes of the file, unpacked where it is a gzip file, without a byte order mark.  Raises FormatError."""
     try:
+        if path.is_char_device() or path.is_block_device():  # /dev/zero has no end
+            raise FormatError(str(path), None, "a device", "a file, or a pipe such as /dev/stdin behind one")
         content = path.read_bytes()
         if content.startswith(b"\x1f\x8b"):
             content = gzip.decompress(content)
