@@ -141,6 +141,17 @@ def test_a_zenoh_configuration_is_a_file_and_said_to_be_one(content: str | None,
     assert ran.stderr.endswith("[bad_file]\n")
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [("maps", *NOWHERE, "--zenoh"), ("serve", "--zenoh"), ("serve", "--config"), ("solve",)],
+)
+def test_what_has_no_end_is_not_read(arguments: tuple[str, ...]) -> None:
+    ran = typed(*arguments, "/dev/zero")
+    assert ran.returncode in (BAD_FILE, USAGE)
+    assert "/dev/zero" in ran.stderr
+    assert "device" in ran.stderr
+
+
 def test_a_graph_without_values_says_what_has_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = tmp_path / "town.g2o"
     source.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")

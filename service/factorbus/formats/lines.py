@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from factorbus.formats.errors import FormatError
-from factorbus.wording.unreadable import mend_of
+from factorbus.wording.unreadable import is_device, mend_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ def _uncommented(line: bytes) -> bytes:
 def read_content(path: Path) -> bytes:
     """The bytes of the file, unpacked where it is a gzip file, without a byte order mark.  Raises FormatError."""
     try:
-        if path.is_char_device() or path.is_block_device():  # /dev/zero has no end
+        if is_device(path):
             raise FormatError(str(path), None, "a device", "a file, or a pipe such as /dev/stdin behind one")
         content = path.read_bytes()
         if content.startswith(b"\x1f\x8b"):
