@@ -152,6 +152,18 @@ def test_what_has_no_end_is_not_read(arguments: tuple[str, ...]) -> None:
     assert "device" in ran.stderr
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [("solve",), ("replay",), ("plot", "map"), ("journal", "verify", "--journal"), ("export", "m", "--journal")],
+)
+def test_a_name_that_is_too_long_is_named(arguments: tuple[str, ...]) -> None:
+    name = "9" * 400
+    ran = typed(*arguments, name)
+    assert ran.returncode == BAD_FILE
+    assert ran.stderr.endswith("cannot be read: File name too long; name another path [bad_file]\n")
+    assert name in ran.stderr
+
+
 def test_a_graph_without_values_says_what_has_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = tmp_path / "town.g2o"
     source.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")

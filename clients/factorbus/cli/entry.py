@@ -1,0 +1,26 @@
+"""The console script: what is interrupted while its modules are still being imported ends without a traceback."""
+
+import os
+import signal
+from typing import Any, NoReturn
+
+_INTERRUPTED = 130  # as in `output/exits.py`, which is imported later
+
+
+def main() -> int:
+    """Run the command line; returns the exit code."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # else somebody has it ignored, as `nohup` does in a shell script
+        signal.signal(signal.SIGINT, _leave)
+    from factorbus.cli.main import main as run
+
+    try:
+        signal.signal(signal.SIGINT, before)
+        return run()
+    except KeyboardInterrupt:
+        _leave()
+
+
+def _leave(*_: Any) -> NoReturn:
+    os.write(2, b"interrupted\n")
+    os._exit(_INTERRUPTED)
