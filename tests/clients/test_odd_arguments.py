@@ -1,4 +1,4 @@
-"""Whatever a call of `Draft` or `Changes` is given is taken for what it is, or refused by name."""
+"""Whatever a call of the client is given is taken for what it is, or refused by name."""
 
 import inspect
 from collections.abc import Callable, Iterator
@@ -7,9 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factorbus.client import Camera, Changes, Draft, ImuNoise
+from factorbus.client import (
+    Camera,
+    Changes,
+    Draft,
+    ImuNoise,
+    Interest,
+    cut_samples,
+    initial_from_standstill,
+    preintegrate_samples,
+)
+from factorbus.proto.interest import checked_interest
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
-from factorbus.proto.problems import Problem
+from factorbus.proto.problems import BadOption, Problem
+from factorbus.proto.symbols import symbol
 
 MASKED: Any = np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False])
 MASKED_KEYS: Any = np.ma.masked_array([1, 2, 3], [False, True, False])
@@ -144,6 +155,41 @@ def test_what_numpy_would_make_something_else_of_is_refused(call: Callable[[], o
     with pytest.raises(Problem) as refused:
         call()
     assert said in str(refused.value)
+
+
+SAMPLES = np.column_stack([np.full(5, 0.01), np.zeros((5, 5)), np.full(5, 9.81)])
+RATES = {"times_s": np.arange(6) / 100, "gyroscope": np.zeros((6, 3)), "accelerometer": np.ones((6, 3))}
+NOISE = {"gyroscope": 1e-3, "accelerometer": 1e-2, "gyroscope_walk": 1e-5, "accelerometer_walk": 1e-4}
+OTHERS: list[tuple[Callable[..., object], dict[str, Any]]] = [
+    (Camera, {"model": "pinhole", "numbers": (500.0, 500.0, 320.0, 240.0), "width": 640, "height": 480}),
+    (ImuNoise, NOISE),
+    (lambda **of: checked_interest(Interest(**of)), dict.fromkeys(("letters", "kinds", "box", "period_ms"))),
+    (cut_samples, {**RATES, "begin_s": 0.0, "end_s": 0.04, "longest_s": 1.0}),
+    (initial_from_standstill, {"samples": SAMPLES, "gravity": 9.81}),
+    (preintegrate_samples, {"samples": SAMPLES, "noise": ImuNoise(**NOISE), "bias": (0,) * 6}),
+    (symbol, {"letter": "x", "index": 1}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "given"), OTHERS)
+def test_what_is_beside_the_draft_takes_anything_for_what_it_is_or_refuses_it(
+    call: Callable[..., object], given: dict[str, Any]
+) -> None:
+    good = {name: value for name, value in given.items() if value is not None}
+    call(**good)
+    for name in given:
+        refused = 0
+        for value in ODD:
+            try:
+                call(**{**good, name: value})
+            except Problem:
+                refused += 1
+        assert refused > len(ODD) / 2, name
+
+
+def test_an_imu_at_rest_is_not_held_against_a_gravity_that_is_no_number() -> None:
+    with pytest.raises(BadOption, match="gravity: nan"):
+        initial_from_standstill(SAMPLES, gravity=float("nan"))
 
 
 def test_a_linear_factor_is_trusted_as_any_other() -> None:

@@ -1,8 +1,10 @@
-"""The console script: what is interrupted while its modules are still being imported ends without a traceback."""
+"""The console script: what is interrupted while its modules are still being imported ends without a traceback.
+
+It imports next to nothing itself, `typing` neither, as a traceback could come of that.
+"""
 
 import os
 import signal
-from typing import Any, NoReturn
 
 _INTERRUPTED = 130  # as in `output/exits.py`, which is imported later
 
@@ -19,8 +21,9 @@ def main() -> int:
         return run()
     except KeyboardInterrupt:
         _leave()
+        raise  # not reached
 
 
-def _leave(*_: Any) -> NoReturn:
+def _leave(*_: object) -> None:
     os.write(2, b"interrupted\n")
     os._exit(_INTERRUPTED)

@@ -24,6 +24,7 @@ from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadOption, NotSupported, Problem, Refused, UnknownMap
 
 _WINDOW = "a whole number, 1 or more"
+_USUAL_S = 10.0
 _LIST_S = 2.0  # to ask for the names of maps, where one was asked for that is not there
 
 
@@ -31,7 +32,7 @@ def connect(
     endpoint: str | Sequence[str],
     *,
     client: str = "client",
-    timeout_s: float = 10.0,
+    timeout_s: float = _USUAL_S,
     settings: Mapping[str, Any] | None = None,
     zenoh: str | PathLike[str] = "",
     listening_s: float | None = None,
@@ -45,7 +46,7 @@ def connect(
     Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting, BadConfigurationFile.
     """
     keys.checked_name("client", client, keys.LONGEST_NAME - SUFFIX_LENGTH)
-    timeout_s = checked_seconds("timeout_s", timeout_s, timeout_s)
+    timeout_s = checked_seconds("timeout_s", timeout_s, _USUAL_S)
     listening_s = None if listening_s is None else checked_seconds("listening_s", listening_s, listening_s)
     endpoints = _endpoints(endpoint)
     of_type("zenoh", zenoh, (str, PathLike), "the path of a file")
