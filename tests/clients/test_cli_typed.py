@@ -107,9 +107,10 @@ def test_standard_output_that_is_full_is_said() -> None:
     )
 
 
-def test_an_encoding_without_our_letters_loses_the_letters_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("encoding", ["ascii", ""], ids=["named", "of the locale"])
+def test_an_encoding_without_our_letters_loses_the_letters_alone(tmp_path: Path, encoding: str) -> None:
     (tmp_path / "a.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
-    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
     ran = typed("replay", str(tmp_path / "a.g2o"), "--in-process", **ascii_only)
     assert ran.returncode == OK, ran.stderr
     assert "|??         | 0, 0 after the last step" in ran.stdout

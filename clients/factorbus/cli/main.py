@@ -135,5 +135,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _print_what_can_be() -> None:
     """What the encoding of a stream does not have, χ in ASCII say, is shown as a question mark."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+        if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
             stream.reconfigure(errors="replace")
