@@ -144,7 +144,16 @@ def test_a_zenoh_configuration_is_a_file_and_said_to_be_one(content: str | None,
 
 @pytest.mark.parametrize(
     "arguments",
-    [("maps", *NOWHERE, "--zenoh"), ("serve", "--zenoh"), ("serve", "--config"), ("solve",)],
+    [
+        ("maps", *NOWHERE, "--zenoh"),
+        ("serve", "--zenoh"),
+        ("serve", "--config"),
+        ("solve",),
+        ("access",),
+        ("gateway", "--people"),
+        ("change", "merge", "a", "b", "--align"),
+        ("work", *NOWHERE, "--zenoh"),
+    ],
 )
 def test_what_has_no_end_is_not_read(arguments: tuple[str, ...]) -> None:
     ran = typed(*arguments, "/dev/zero")

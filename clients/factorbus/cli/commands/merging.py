@@ -8,7 +8,7 @@ import click
 
 from factorbus.cli.output.advice import MERGING, advising
 from factorbus.cli.output.console import document, table
-from factorbus.cli.output.exits import OK
+from factorbus.cli.output.exits import OK, input_file
 from factorbus.cli.process.options import MapAddress, grouped
 from factorbus.wording import counted
 
@@ -131,14 +131,12 @@ def _show(merged: Any, found: Any, as_json: bool) -> None:
 
 
 def _candidates(file: Path, sigmas: str | None) -> Any:
-    """Of each line a relative pose.  Raises UsageError."""
+    """Of each line a relative pose.  Raises UsageError, Stopped."""
     from factorbus.client import Draft
 
     draft, usual = Draft(), None if sigmas is None else _numbers("--sigmas", sigmas)
-    try:
+    with input_file(file):
         text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as problem:
-        raise click.UsageError(f"--align {file}: {problem}; wanted a text file, a line for each candidate") from problem
     for number, line in enumerate(text.splitlines(), 1):
         fields = line.partition("#")[0].split()
         if not fields:
