@@ -42,6 +42,7 @@ WRONG = {
         "72057594037927936 as a 2D point, which is a 2D pose on line 1",
     ),
     "infinity as MSVC prints it": ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 1.#INF\n", 2, "'1.#INF'"),
+    "undefined as MSVC prints it": (f"{GOOD}EDGE_SE2 1 2 -1.#IND00 0 0 {INFO3}\n", 2, "'-1.#IND00'"),
     "number that is none, as MSVC prints it": (f"{GOOD}EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1.#QNAN\n", 2, "'1.#QNAN'"),
     "comment in the middle": (f"{GOOD}EDGE_SE2 0 1 1 # 0 0 {INFO3}\n", 2, "3 fields; wanted 11"),
     "switch with weight 0": (f"{GOOD}EDGE_SWITCH_PRIOR 4 1 0\n", 2, "information above 0"),

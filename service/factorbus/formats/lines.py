@@ -1,12 +1,16 @@
 """From a file to its lines, in buckets by the name of the record."""
 
 import gzip
+import re
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from factorbus.formats.errors import FormatError
 from factorbus.wording.unreadable import is_device, mend_of
+
+# Behind a point and before one of these it is a number that is none, as Microsoft's compilers have printed them.
+_COMMENT = re.compile(rb"(?<!\.)#|#(?!INF|IND|QNAN|SNAN)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +24,7 @@ class Bucket:
 def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
     """The lines of `content` by record, in the order of the file; blank lines and comments are left out.
 
-    A comment begins with a # that begins a word: 1.#INF, as some compilers print an infinity, is no 1.
+    A comment begins with a #; that of 1.#INF, as some compilers print an infinity, begins none.
     Raises FormatError when it is not text or has no record.
     """
     if b"\0" in content:
@@ -43,10 +47,8 @@ def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
 
 def _uncommented(line: bytes) -> bytes:
     """`line` up to its comment."""
-    at = line.find(b"#")
-    while at > 0 and not line[at - 1 : at].isspace():
-        at = line.find(b"#", at + 1)
-    return line if at < 0 else line[:at]
+    found = _COMMENT.search(line) if b"#" in line else None
+    return line[: found.start()] if found else line
 
 
 def read_content(path: Path) -> bytes:
