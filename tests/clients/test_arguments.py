@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from faulty.service import MAP, Service, endpoint_in
 
-from factorbus.client import Bus, Changes, Draft, Map, Unavailable, aio, connect
+from factorbus.client import Bus, Camera, Changes, Draft, Map, Unavailable, aio, connect
 from factorbus.client.changes import some_of
 from factorbus.client.draft import batch_of
 from factorbus.client.merging import fit_into
@@ -21,6 +21,7 @@ from factorbus.proto.problems import BadLoss, BadOption, BadShape, ClosedHere, P
 from factorbus.proto.symbols import symbol
 
 ANY: Any = "no"  # a str, whatever the signature says
+CAMERA = Camera("pinhole", (500.0, 500.0, 320.0, 240.0), 640, 480)
 POINT = Draft().point2("l1", (1, 0))
 
 
@@ -71,7 +72,14 @@ def kitchen(bus: Bus) -> Iterator[Map]:
         (lambda: connect([]), "endpoint: an empty list; wanted an address such as"),
         (lambda: connect("tcp/127.0.0.1:1", settings=cast("Any", 5)), "settings: 5 (int); wanted a mapping of path"),
         (lambda: connect("tcp/127.0.0.1:1", zenoh=cast("Any", 5)), "zenoh: 5 (int); wanted the path of a file"),
-        (lambda: Draft().se2("x2", fixd=ANY), "se2 x2: there is no keyword 'fixd'; wanted fixed, stamp"),
+        (
+            lambda: Draft().se2("x2", **cast("Any", {"fixd": ANY})),
+            "se2 x2: there is no keyword 'fixd'; wanted fixed, stamp",
+        ),
+        (
+            lambda: fit_into(Estimate(1, 1, ()), MapGraph(1, 1, Batch()), letters=cast("Any", np.zeros(2))),
+            "letters: an object of type ndarray; wanted a mapping of letters",
+        ),
         (
             lambda: fit_into(Estimate(1, 1, ()), MapGraph(1, 1, Batch()), letters=ANY),
             "letters: 'no' (str); wanted a mapping of letters",
@@ -185,6 +193,11 @@ def test_true_and_false_of_numpy_will_do() -> None:
     [
         (lambda m: m.insert("hello"), "batch: 'hello' (str); wanted a Draft or a Batch"),
         (lambda m: m.insert(Changes()), "batch: an object of type Changes; wanted a Draft or a Batch"),
+        (lambda m: m.send(POINT, convert_below=""), "convert_below: '' (str); wanted a finite number, 0 or more"),
+        (lambda m: m.insert(POINT, convert_below=math.nan), "convert_below: nan (float); wanted a finite number, 0"),
+        (lambda m: m.insert(POINT, convert_below=-1), "convert_below: -1 (int); wanted a finite number, 0 or more"),
+        (lambda m: m.insert(POINT, convert_below=np.zeros(2)), "convert_below: an object of type ndarray; wanted"),
+        (lambda m: m.repair(probability=10**400), "wanted a number between 0 and 1"),
         (lambda m: m.send(POINT, settle="no"), "settle: 'no' (str); wanted True or False"),
         (lambda m: m.insert(POINT, changes=POINT), "changes: an object of type Draft; wanted a Changes"),
         (lambda m: m.change("no"), "changes: 'no' (str); wanted a Changes"),
@@ -230,6 +243,11 @@ def test_of_a_bus(bus: Bus) -> None:
     for call, said in (
         (lambda: strange.map(MAP, window="many"), "window: 'many' (str); wanted a whole number, 1 or more"),
         (lambda: strange.map(MAP, window=0), "window: 0; wanted a whole number, 1 or more"),
+        (lambda: strange.map(MAP, window=True), "window: True; wanted a whole number, 1 or more"),
+        (lambda: strange.map(MAP, client=0), "client: 0 (int); wanted a name, or an empty text for that of the conn"),
+        (lambda: strange.features(CAMERA, rho="1"), "rho: '1' (str); wanted a finite number"),
+        (lambda: strange.features(CAMERA, sigma_pixel=math.nan), "sigma_pixel: nan (float); wanted a finite number"),
+        (lambda: strange.features(CAMERA, service=5), "service: 5 (int); wanted the name of a service"),
         (lambda: strange.map(MAP, mirror="no"), "mirror: 'no' (str); wanted True or False"),
         (lambda: strange.map(MAP, create="no"), "create: 'no' (str); wanted True or False"),
         (lambda: strange.drop(MAP, missing_ok="no"), "missing_ok: 'no' (str); wanted True or False"),
@@ -304,5 +322,6 @@ def test_a_map_without_a_mirror_says_so(bus: Bus) -> None:
 
 def test_a_map_that_was_left_says_so(kitchen: Map) -> None:
     kitchen.close()
-    with pytest.raises(ClosedHere, match=f"map '{MAP}': it was closed here; open it again"):
-        kitchen.insert(POINT)
+    for call in (lambda: kitchen.insert(POINT), kitchen.rejoin, kitchen.open_mirror):
+        with pytest.raises(ClosedHere, match=f"map '{MAP}': it was closed here; open it again"):
+            call()

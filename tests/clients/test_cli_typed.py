@@ -107,9 +107,10 @@ def test_standard_output_that_is_full_is_said() -> None:
     )
 
 
-def test_an_encoding_without_our_letters_loses_the_letters_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("encoding", ["ascii", ""], ids=["named", "of the locale"])
+def test_an_encoding_without_our_letters_loses_the_letters_alone(tmp_path: Path, encoding: str) -> None:
     (tmp_path / "a.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
-    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
     ran = typed("replay", str(tmp_path / "a.g2o"), "--in-process", **ascii_only)
     assert ran.returncode == OK, ran.stderr
     assert "|??         | 0, 0 after the last step" in ran.stdout
@@ -139,6 +140,38 @@ def test_a_zenoh_configuration_is_a_file_and_said_to_be_one(content: str | None,
     assert ran.returncode == BAD_FILE
     assert ran.stderr.startswith(f"factorbus: the zenoh configuration {path}, which ZENOH_CONFIG names, cannot be read")
     assert ran.stderr.endswith("[bad_file]\n")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("maps", *NOWHERE, "--zenoh"),
+        ("serve", "--zenoh"),
+        ("serve", "--config"),
+        ("solve",),
+        ("access",),
+        ("gateway", "--people"),
+        ("change", "merge", "a", "b", "--align"),
+        ("work", *NOWHERE, "--zenoh"),
+    ],
+)
+def test_what_has_no_end_is_not_read(arguments: tuple[str, ...]) -> None:
+    ran = typed(*arguments, "/dev/zero")
+    assert ran.returncode in (BAD_FILE, USAGE)
+    assert "/dev/zero" in ran.stderr
+    assert "device" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("solve",), ("replay",), ("plot", "map"), ("journal", "verify", "--journal"), ("export", "m", "--journal")],
+)
+def test_a_name_that_is_too_long_is_named(arguments: tuple[str, ...]) -> None:
+    name = "9" * 400
+    ran = typed(*arguments, name)
+    assert ran.returncode == BAD_FILE
+    assert ran.stderr.endswith("cannot be read: File name too long; name another path [bad_file]\n")
+    assert name in ran.stderr
 
 
 def test_a_graph_without_values_says_what_has_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

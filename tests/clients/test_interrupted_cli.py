@@ -39,6 +39,38 @@ def deaf(grace_s: float) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
+# As if Ctrl-C were pressed while the first of our modules is imported.
+EARLY = """
+import builtins, os, signal, sys
+from factorbus.cli.entry import main
+
+imported = builtins.__import__
+
+def interrupted(name, *rest):
+    if name.startswith("factorbus"):
+        os.kill(os.getpid(), signal.SIGINT)
+    return imported(name, *rest)
+
+if "ignored" in sys.argv:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+builtins.__import__ = interrupted
+sys.argv = ["factorbus", "--version"]
+print("ended with", main())
+"""
+
+
+def test_one_that_is_interrupted_before_all_is_imported_says_so_and_no_more() -> None:
+    ran = subprocess.run([sys.executable, "-c", EARLY], capture_output=True, text=True, timeout=60, check=False)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (INTERRUPTED, "", "interrupted\n")
+
+
+def test_where_interrupts_are_ignored_they_stay_so() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", EARLY, "ignored"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ran.stdout.endswith("ended with 0\n")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_does_not_end_by_itself_is_ended(number: int) -> None:
     with deaf(0.1) as process:

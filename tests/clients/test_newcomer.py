@@ -61,7 +61,9 @@ def test_an_example_says_how_it_is_called(example: str) -> None:
         ["ask", "why", "yard", "x1"], ["stats"], ["maps"], ["top", "--once"], ["drop", "yard"],
         ["save", "yard", "a.g2o"],
         ["watch", "yard", "--save", "a.rrd"], ["record", "yard", "--out", "a.mcap"], ["gateway", "--port", "0"],
-        ["change", "fix", "yard", "x1"], ["plot", "map", "yard"], ["replay", "one.g2o"], ["ros2", "yard"],
+        ["change", "fix", "yard", "x1"], ["change", "adopt", "yard"], ["change", "fork", "yard", "b"],
+        ["change", "merge", "yard", "b"], ["ask", "chi2", "yard", "--batch"], ["budget", "yard", "5"],
+        ["plot", "map", "yard"], ["replay", "one.g2o"], ["ros2", "yard"],
     ],
 )  # fmt: skip
 def test_where_nothing_listens_it_is_said_within_about_a_second(

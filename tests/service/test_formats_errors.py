@@ -1,6 +1,8 @@
 """Every way in which a file is wrong names the file, the line, what stands there and what was wanted."""
 
 import gzip
+import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -39,6 +41,9 @@ WRONG = {
         2,
         "72057594037927936 as a 2D point, which is a 2D pose on line 1",
     ),
+    "infinity as MSVC prints it": ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 1.#INF\n", 2, "'1.#INF'"),
+    "undefined as MSVC prints it": (f"{GOOD}EDGE_SE2 1 2 -1.#IND00 0 0 {INFO3}\n", 2, "'-1.#IND00'"),
+    "number that is none, as MSVC prints it": (f"{GOOD}EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1.#QNAN\n", 2, "'1.#QNAN'"),
     "comment in the middle": (f"{GOOD}EDGE_SE2 0 1 1 # 0 0 {INFO3}\n", 2, "3 fields; wanted 11"),
     "switch with weight 0": (f"{GOOD}EDGE_SWITCH_PRIOR 4 1 0\n", 2, "information above 0"),
     "mixture with weight below 0": (f"{GOOD}EDGE_SE2_MAXMIX 0 1 -1 1 0 0 {INFO3}\n", 2, "with the weight -1"),
@@ -113,6 +118,23 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
         read(tmp_path / "nowhere.g2o")
     with pytest.raises(FormatError, match="cannot be read"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_pipe_is_read_whole(tmp_path: Path, packed: bool) -> None:
+    pipe = tmp_path / "pipe.g2o"
+    os.mkfifo(pipe)
+    content = gzip.compress(GOOD.encode()) if packed else GOOD.encode()
+    writer = threading.Thread(target=pipe.write_bytes, args=(content,), daemon=True)
+    writer.start()
+    assert read(pipe).batch.factor_count == 1
+    writer.join(10)
+
+
+@pytest.mark.parametrize("device", ["/dev/zero", "/dev/null"])
+def test_a_device_is_refused_and_not_read_for_ever(device: str) -> None:
+    with pytest.raises(FormatError, match=f"{device}: a device; wanted a file, or a pipe"):
+        read(device)
 
 
 def test_damaged_gzip(tmp_path: Path) -> None:

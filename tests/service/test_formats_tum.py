@@ -210,3 +210,10 @@ def test_a_mount_is_no_robot() -> None:
     )  # fmt: skip
     rows = tum_text(Batch((poses(None), mount), (way,))).splitlines()
     assert [row.split()[0] for row in rows] == ["0", "1", "2"]
+
+
+def test_a_trajectory_of_kitti_is_called_one(tmp_path: Path) -> None:
+    path = tmp_path / "00.txt"
+    path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(FormatError, match=r"00\.txt:1: a KITTI pose, which is written and not read; wanted a graph"):
+        read(path)

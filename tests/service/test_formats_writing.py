@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 
 from factorbus.formats import (
     FormatError,
+    Written,
     as_g2o,
+    as_jrl,
+    as_pyfg,
     g2o_text,
     kitti_text,
     read,
@@ -294,3 +297,36 @@ def test_text_of_kitti(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses[2], [[0, 1, 0, 1], [0, 0, 1, 2], [1, 0, 0, 3]], atol=1e-15)
     write_kitti(tmp_path / "a.kitti", batch)
     assert (tmp_path / "a.kitti").read_text() == kitti_text(batch)
+
+
+# Positive definite, and with an inverse beyond what a double holds.
+WITHOUT_COVARIANCE = ([5e-324, 0, 0, 1, 0, 1], [1, 0, 0, 1e-310, 0, 1], [1e-320, 0, 0, 1e-320, 0, 1e-320])
+
+
+@pytest.mark.parametrize("information", WITHOUT_COVARIANCE)
+@pytest.mark.parametrize("form", [as_jrl, as_pyfg], ids=["jrl", "pyfg"])
+def test_what_has_no_covariance_is_left_out_of_a_form_that_has_them(
+    form: Callable[..., Written], information: list[float], tmp_path: Path
+) -> None:
+    batch = small()
+    edge, _ = batch.factors
+    both = Factors(edge.kind, np.repeat(edge.keys, 2, 0), np.repeat(edge.measured, 2, 0), np.eye(6)[[0, 0]])
+    both.information[:] = [[1.0, 0, 0, 1, 0, 1], information]
+    written = form(Batch(batch.variables, (both,)))
+    assert written.left_out["between_se2"] == 1
+    assert "1 between_se2 left out: the information matrix has no inverse" in " ".join(written.notes)
+    path = tmp_path / f"out.{'jrl' if form is as_jrl else 'pyfg'}"
+    path.write_text(written.text)
+    assert read(path).batch.factor_count == 1
+
+
+@pytest.mark.parametrize("form", [as_jrl, as_pyfg], ids=["jrl", "pyfg"])
+def test_a_certainty_at_the_end_of_what_a_double_holds_is_read_back(
+    form: Callable[..., Written], tmp_path: Path
+) -> None:
+    batch = small()
+    edge, _ = batch.factors
+    sure = edge._replace(information=np.array([[1e308, 0, 0, 1e308, 0, 1]]))
+    path = tmp_path / f"out.{'jrl' if form is as_jrl else 'pyfg'}"
+    path.write_text(form(Batch(batch.variables, (sure,))).text)
+    np.testing.assert_allclose(read(path).batch.factors[0].information, sure.information, rtol=1e-9)

@@ -155,7 +155,13 @@ OBSERVATIONS, _P = random_observations(8, 2)
         ({"covariance": np.eye(13) + np.eye(13, k=1)}, BadState),
         ({"pixels": np.zeros((2, 3))}, BadShape),
         ({"rho": np.nan}, BadState),
+        ({"rho": -1.1e12}, BadState),
         ({"sigma_rho": 0.0}, BadState),
+        ({"sigma_rho": 1.1e12}, BadState),
+        ({"sigma_pixel": 1e200}, BadState),
+        ({"sigma_pixel": 0.9e-12}, BadState),
+        ({"state": np.array([1.1e12, *np.zeros(2), 1, *np.zeros(9)])}, BadState),
+        ({"covariance": np.eye(13) * 1.1e24}, BadState),
         ({"sigma_pixel": -1.0}, BadState),
     ],
 )

@@ -2,6 +2,6 @@
 
 import sys
 
-from factorbus.cli.main import main
+from factorbus.cli.entry import main
 
 sys.exit(main())

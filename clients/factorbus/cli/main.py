@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import click
 
 from factorbus.cli.output.console import document
-from factorbus.cli.output.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, Stopped, report
+from factorbus.cli.output.exits import BAD_FILE, EXIT_CODES, INTERRUPTED, OK, USAGE, Stopped, report
 from factorbus.proto.nearest import nearest
 from factorbus.proto.version import __version__
 
@@ -121,6 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return OK
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:  # which nobody who looks whether a path is there expects
+            told = f"{error.filename} cannot be read: {error.strerror}; name another path"
+            return report(Stopped("bad_file", told, BAD_FILE, path=str(error.filename)), as_json, debug)
         if error.errno not in _FULL or error.filename is not None:
             return report(error, as_json=as_json, debug=debug)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -132,5 +135,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _print_what_can_be() -> None:
     """What the encoding of a stream does not have, χ in ASCII say, is shown as a question mark."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+        if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
             stream.reconfigure(errors="replace")

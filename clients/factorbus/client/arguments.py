@@ -2,6 +2,7 @@
 
 import math
 import threading
+import types
 from collections.abc import Iterable, Sequence
 from numbers import Real
 from typing import Any, TypeVar
@@ -14,6 +15,9 @@ from factorbus.proto.problems import BadOption, BadShape, NotFiniteNumbers
 
 T = TypeVar("T")
 _FEW = 12  # numbers that are shown whole
+_NO_NUMBERS = types.MappingProxyType(
+    {"U": "text", "S": "text", "c": "complex numbers", "M": "times", "m": "durations", "V": "records"}
+)
 _PLAIN = (str, bytes, int, float, complex, list, tuple, dict, type(None))
 
 
@@ -43,16 +47,23 @@ def checked_duration(what: str, given: Any) -> float:
     return _seconds(what, given, "seconds: a finite number, 0 or more")
 
 
-def as_numbers(what: str, given: Any, wanted: str = "numbers") -> F64:
-    """`given` as an array of floats, of any shape; text is none, though NumPy would read it.  Raises BadShape."""
+def as_numbers(what: str, given: Any, wanted: str = "numbers", *, copy: bool = True) -> F64:
+    """`given` as an array of floats, of any shape.  Raises BadShape.
+
+    NumPy would read a text as a number, a time as one of whatever unit it has, of a complex number the real part,
+    and of a masked array what the mask hides: none of these is taken.  copy: False where nobody keeps it.
+    """
     try:
-        numbers = np.array(given, np.float64)
-        is_text = not isinstance(given, (float, int)) and np.asarray(given).dtype.kind in "US"
-    except (TypeError, ValueError):
+        seen_as = np.asarray(given)
+        mixed = seen_as.dtype.kind == "O"
+        for kind in map(_kind_of, seen_as.flat) if mixed else (seen_as.dtype.kind,):
+            if kind in _NO_NUMBERS:
+                raise BadShape(what, repr(given)[:80], f"{wanted}, not {_NO_NUMBERS[kind]}")
+        if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
+            raise BadShape(what, repr(given)[:80], f"{wanted}, none of which is masked")
+        return np.array(given, np.float64, copy=True if copy else None)
+    except (TypeError, ValueError, OverflowError):
         raise BadShape(what, repr(given)[:80], wanted) from None
-    if is_text:
-        raise BadShape(what, repr(given)[:80], f"{wanted}, not text")
-    return numbers
 
 
 def all_finite(what: str, numbers: F64) -> F64:
@@ -72,9 +83,25 @@ def checked_row(what: str, numbers: Any, size: int) -> F64:
 
 def checked_probability(what: str, given: Any) -> float:
     """Between 0 and 1, neither of the two.  Raises BadOption."""
-    number = math.nan if isinstance(given, (bool, np.bool_)) or not isinstance(given, Real) else float(given)
+    number = _real(given)
     if not 0.0 < number < 1.0:
         raise BadOption(what, seen(given), "a number between 0 and 1")
+    return number
+
+
+def checked_number(what: str, given: Any) -> float:
+    """One finite number.  Raises BadOption."""
+    number = _real(given)
+    if not math.isfinite(number):
+        raise BadOption(what, seen(given), "a finite number")
+    return number
+
+
+def checked_bound(what: str, given: Any) -> float:
+    """0 or more, and finite.  Raises BadOption."""
+    number = _real(given)
+    if not 0.0 <= number < math.inf:
+        raise BadOption(what, seen(given), "a finite number, 0 or more")
     return number
 
 
@@ -86,13 +113,25 @@ def checked_keywords(what: str, given: Iterable[str], wanted: Sequence[str]) -> 
 
 
 def _seconds(what: str, given: Any, wanted: str) -> float:
-    try:
-        number = math.nan if isinstance(given, (bool, np.bool_)) or not isinstance(given, Real) else float(given)
-    except OverflowError:  # a whole number beyond all floats
-        number = math.inf
+    number = _real(given)
     if not 0.0 <= number <= threading.TIMEOUT_MAX:
         raise BadOption(what, seen(given), wanted)
     return number
+
+
+def _real(given: Any) -> float:
+    """A number as a float; NaN for anything else, for True too."""
+    if isinstance(given, (bool, np.bool_)) or not isinstance(given, Real):
+        return math.nan
+    try:
+        return float(given)
+    except OverflowError:  # a whole number beyond all floats
+        return math.nan
+
+
+def _kind_of(given: Any) -> str:
+    """NumPy's letter for what one thing is."""
+    return np.asarray(given).dtype.kind
 
 
 def _first_not_finite(numbers: F64) -> str:

@@ -23,6 +23,8 @@ from factorbus.proto.keep import KEEP_ALL, keep_text
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadOption, NotSupported, Problem, Refused, UnknownMap
 
+_WINDOW = "a whole number, 1 or more"
+_USUAL_S = 10.0
 _LIST_S = 2.0  # to ask for the names of maps, where one was asked for that is not there
 
 
@@ -30,7 +32,7 @@ def connect(
     endpoint: str | Sequence[str],
     *,
     client: str = "client",
-    timeout_s: float = 10.0,
+    timeout_s: float = _USUAL_S,
     settings: Mapping[str, Any] | None = None,
     zenoh: str | PathLike[str] = "",
     listening_s: float | None = None,
@@ -44,11 +46,11 @@ def connect(
     Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting, BadConfigurationFile.
     """
     keys.checked_name("client", client, keys.LONGEST_NAME - SUFFIX_LENGTH)
-    timeout_s = checked_seconds("timeout_s", timeout_s, timeout_s)
+    timeout_s = checked_seconds("timeout_s", timeout_s, _USUAL_S)
     listening_s = None if listening_s is None else checked_seconds("listening_s", listening_s, listening_s)
     endpoints = _endpoints(endpoint)
     of_type("zenoh", zenoh, (str, PathLike), "the path of a file")
-    settings = of_type("settings", settings or {}, Mapping, "a mapping of path to value")
+    settings = of_type("settings", {} if settings is None else settings, Mapping, "a mapping of path to value")
     return Bus(open_link(endpoints, timeout_s, settings, str(zenoh), listening_s), client, timeout_s)
 
 
@@ -90,10 +92,11 @@ class Bus:
         Raises Refused, Unavailable, BadName, BadOption, UnknownKind, UnknownMap, NotSupported.
         """
         keys.checked_name("map", name)
-        client = keys.checked_name("client", client or self.client, keys.LONGEST_NAME - SUFFIX_LENGTH)
+        client = of_type("client", client, str, "a name, or an empty text for that of the connection") or self.client
+        keys.checked_name("client", client, keys.LONGEST_NAME - SUFFIX_LENGTH)
         mirror, create = checked_flag("mirror", mirror), checked_flag("create", create)
-        if of_type("window", window, Integral, "a whole number, 1 or more") < 1:
-            raise BadOption("window", str(window), "a whole number, 1 or more")
+        if isinstance(window, bool) or of_type("window", window, Integral, _WINDOW) < 1:
+            raise BadOption("window", str(window), _WINDOW)
         part = None if interest is None else checked_interest(of_type("interest", interest, Interest, "an Interest"))
         if part is not None and not mirror:
             raise BadOption("interest", "given with mirror=False", "a mirror, which the interest is about")
@@ -124,6 +127,8 @@ class Bus:
         of v (pixels).  service: its name; empty: whichever is there.
         """
         of_type("camera", camera, Camera, "a Camera")
+        if of_type("service", service, str, "the name of a service, or an empty text for any"):
+            keys.checked_name("service", service)
         made = Features(
             self._link,
             self._sender,

@@ -12,10 +12,9 @@ import time
 from concurrent.futures import Future
 from contextlib import ExitStack
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import checked_seconds
+from factorbus.client.arguments import as_numbers, checked_number, checked_seconds
 from factorbus.client.filter_state import Factored, FilterState, augmented, factored
 from factorbus.client.link import Link
 from factorbus.client.request_sender import Request, RequestSender
@@ -64,7 +63,11 @@ class Features:
         sigma_pixel: float = 1.0,
         service: str = "",
     ) -> None:
-        self.camera, self.rho, self.sigma_rho, self.sigma_pixel = camera, rho, sigma_rho, sigma_pixel
+        self.camera = camera
+        self.rho, self.sigma_rho, self.sigma_pixel = (
+            checked_number(name, given)
+            for name, given in (("rho", rho), ("sigma_rho", sigma_rho), ("sigma_pixel", sigma_pixel))
+        )
         self._link, self._sender, self._timeout_s, self._service = link, sender, timeout_s, service
         self._pool = SharedMemoryPool()
         self._shared = True  # until an answer shows that nobody there shares memory with us
@@ -109,7 +112,8 @@ class Features:
 
         Of P, its first 13 rows will do.  Raises as `grow`.
         """
-        observations = self._observations(np.asarray(x, np.float64), np.asarray(P, np.float64), pixels)
+        state, covariance = as_numbers("x", x, copy=False), as_numbers("P", P, copy=False)
+        observations = self._observations(state, covariance, pixels)
         answer: FeaturesAnswer = self._ask(Ask(observations, "factored"), timeout_s).future.result()
         return factored(observations, answer)
 
@@ -129,7 +133,7 @@ class Features:
         return self._ask(Ask(ask.observations, "half"), timeout_s)
 
     def _observations(self, x: F64, P: F64, pixels: ArrayLike) -> Observations:
-        seen = np.asarray(pixels, np.float64)
+        seen = as_numbers("pixels", pixels, copy=False)
         if seen.ndim != 2 or seen.shape[1] != 2:
             raise BadShape("pixels", " × ".join(map(str, seen.shape)), "n × 2")
         if x.ndim != 1 or x.size < CAMERA_STATE or P.ndim != 2 or P.shape[0] < CAMERA_STATE or P.shape[1] != x.size:
@@ -214,7 +218,7 @@ class Growing:
 
 
 def _matching(x: ArrayLike, P: ArrayLike) -> tuple[F64, F64]:
-    state, covariance = np.asarray(x, np.float64), np.asarray(P, np.float64)
+    state, covariance = as_numbers("x", x, copy=False), as_numbers("P", P, copy=False)
     if state.ndim != 1 or covariance.shape != (state.size, state.size):
         raise BadShape("x and P", f"{state.shape} and {covariance.shape}", "(m,) and (m, m)")
     return state, covariance

@@ -168,8 +168,9 @@ def with_information(key: Key, certainty: Mapping[str, Any]) -> Mapping[str, Any
     rest = {name: value for name, value in certainty.items() if name != "covariance"}
     if certainty.get("covariance") is None:
         sigmas = certainty.get("sigmas")
-        if sigmas is not None and np.shape(sigmas) != (3,):
-            raise BadShape(f"{where}: sigmas", f"shape {np.shape(sigmas)}", "(3,): of east, north, up (metres)")
+        shape = (3,) if sigmas is None else as_numbers(f"{where}: sigmas", sigmas).shape
+        if shape != (3,):
+            raise BadShape(f"{where}: sigmas", f"shape {shape}", "(3,): of east, north, up (metres)")
         return rest
     return {**rest, **inverted(where, certainty["covariance"], rest)}
 

@@ -16,7 +16,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import all_finite, as_numbers, checked_row, of_type, seen
+from factorbus.client.arguments import all_finite, as_numbers, checked_bound, checked_number, checked_row, of_type, seen
 from factorbus.client.certainty import Certainty
 from factorbus.client.frames import rotation_of
 from factorbus.client.imu_samples import refuse_gaps, refuse_not_finite, warn_implausible
@@ -53,8 +53,10 @@ class ImuNoise:
     integration: float = 0.0
 
     def __post_init__(self) -> None:
-        for field, value in zip(fields(self), astuple(self), strict=True):
-            number = float(as_numbers(f"ImuNoise: {field.name}", value, "a number").sum())
+        for field in fields(self):
+            value = getattr(self, field.name)
+            numbers = as_numbers(f"ImuNoise: {field.name}", value, "a number")
+            number = float(numbers.sum()) if numbers.size == 1 else np.nan
             if not (np.isfinite(number) and (number > 0.0 or (field.name == "integration" and number == 0.0))):
                 wanted = "0 or more" if field.name == "integration" else "a finite number above 0"
                 raise BadOption(f"ImuNoise: {field.name}", seen(value), wanted)
@@ -149,6 +151,7 @@ def cut_samples(
             raise BadShape(name, f"shape {each.shape} with times of shape {times.shape}", "(m, 3) with times (m,)")
     if (np.diff(times) <= 0.0).any():
         raise BadOption("times_s", "a time that is not after the one before", "increasing times")
+    begin_s, end_s = checked_number("begin_s", begin_s), checked_number("end_s", end_s)
     if not begin_s < end_s:
         raise BadOption("begin_s, end_s", f"{begin_s!r}, {end_s!r}", "begin_s before end_s")
     if not times.size or times[0] > begin_s:
@@ -167,7 +170,7 @@ def initial_from_standstill(
     gravity: its magnitude, m/s².  mount: the IMU's pose on the robot, as of `Draft.imu`.
     Raises BadShape, NotFiniteNumbers, BadOption: it moves, or measures another gravity.
     """
-    rows = checked_samples("samples", samples)
+    rows, gravity = checked_samples("samples", samples), checked_bound("gravity", gravity)
     if len(rows) < 2:
         raise BadShape("samples", len(rows), "2 or more of standing still; a second of them is good")
     mean, spread = rows[:, 1:].mean(axis=0), rows[:, 1:].std(axis=0, ddof=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from numbers import Real
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from factorbus.client.arguments import seen
 from factorbus.proto.arrays import F64
 from factorbus.proto.problems import BadOption, NotFiniteNumbers
 
+_ENDLESS_S = 1e12  # whatever is longer; a whole number may be beyond all floats
 GAP = 10.0  # times the median interval that a sample may hold
 _COLUMNS = ("duration", *(f"{sensor} {axis}" for sensor in ("gyroscope", "accelerometer") for axis in "xyz"))
 _STANDARD = 9.80665  # m/s²
@@ -29,9 +31,9 @@ def refuse_gaps(times: F64, held: F64, end_s: float, longest_s: float | None) ->
     steps = np.diff(times)
     if longest_s is None and not steps.size:
         return
-    if longest_s is not None and not longest_s > 0.0:
+    if longest_s is not None and not (isinstance(longest_s, Real) and longest_s > 0.0):
         raise BadOption("longest_s", seen(longest_s), "seconds above 0, or None")
-    limit = GAP * float(np.median(steps)) if longest_s is None else float(longest_s)
+    limit = GAP * float(np.median(steps)) if longest_s is None else float(min(longest_s, _ENDLESS_S))
     whole = np.append(steps, end_s - times[-1])
     if not (bad := np.flatnonzero((held > 0.0) & (whole > limit))).size:
         return

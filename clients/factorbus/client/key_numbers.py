@@ -12,6 +12,7 @@ from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import parse_symbol
 
 Key: TypeAlias = str | int
+_TEXTS = (str, bytes, bytearray, memoryview)
 _LOWEST, _HIGHEST = -(2**63), 2**63 - 1
 
 
@@ -27,7 +28,7 @@ def key_number(key: Key) -> int:
 
 def key_numbers(of: Iterable[Key] | Key) -> I64:
     """The int64 of each key; of one, an array of one.  Raises BadSymbol."""
-    if isinstance(of, np.ndarray) and of.ndim and of.dtype.kind == "i":
+    if isinstance(of, np.ndarray) and of.ndim and of.dtype.kind == "i" and not np.ma.is_masked(of):
         return of.astype(np.int64).reshape(-1)
     return np.array([key_number(key) for key in _each(of)], np.int64)
 
@@ -53,8 +54,9 @@ def stamp_number(where: str, stamp: int | None) -> int:
 
 
 def _each(given: Any) -> Iterable[Any]:
-    alone = isinstance(given, str) or not hasattr(given, "__iter__") or getattr(given, "ndim", 1) == 0
-    return (given,) if alone else given
+    if isinstance(given, _TEXTS) or not hasattr(given, "__iter__") or getattr(given, "ndim", 1) == 0:
+        return (given,)
+    return given
 
 
 def _whole(given: Any) -> int | None:

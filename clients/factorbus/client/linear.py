@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import all_finite, as_numbers, of_type
+from factorbus.client.arguments import all_finite, as_numbers, checked_flag, of_type
 from factorbus.client.certainty import Certainty, full, loss_of, triangle_of
 from factorbus.proto.arrays import F64
 from factorbus.proto.kinds import MOST_JOINED, VARIABLE_KINDS, linear_kind
@@ -31,8 +31,9 @@ def linear_factor(
     where = " ".join(["linear", *map(format_symbol, keys)])
     for name, given in (("values", values), ("jacobians", jacobians), ("kinds", kinds)):
         of_type(f"{where}: {name}", given, Collection, "one for each key")
+    trusted = checked_flag(f"{where}: trusted", certainty.get("trusted", False))
     y = [all_finite(where, as_numbers(f"{where}: values", value)) for value in values]
-    names = list(kinds)
+    names = [of_type(f"{where}: kinds", kind, str, "names of kinds of variables") for kind in kinds]
     if len(names) == len(y) and not all(names):
         names = _all_kinds(where, keys, y, jacobians, names)
     b = all_finite(where, as_numbers(f"{where}: residual", residual))
@@ -51,7 +52,7 @@ def linear_factor(
     blocks = [block.reshape(-1) for block in np.split(H, np.cumsum(dims)[:-1], axis=1)]
     measured, ends = np.concatenate([*y, *blocks, b])[None], np.array([keys])
     kind = linear_kind(b.size, tuple(names)).name
-    return Factors(kind, ends, measured, triangle[None], loss, np.array([scale]) if loss else None)
+    return Factors(kind, ends, measured, triangle[None], loss, np.array([scale]) if loss else None, None, trusted)
 
 
 def _check_counts(where: str, keys: Sequence[int], *counts: int) -> None:

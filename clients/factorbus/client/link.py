@@ -19,6 +19,7 @@ from factorbus.client.replies import AnswerReply, Failure, Reply, Silence, Timed
 from factorbus.proto import keys, redact
 from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.problems import BadConfigurationFile, BadSetting, ClosedHere, NobodyListens, Unavailable
+from factorbus.wording.unreadable import is_device
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
 _TIMED_OUT = b"Timeout"
@@ -209,10 +210,12 @@ def open_session(
 def _config(endpoints: Sequence[str], settings: Mapping[str, Any], file: str) -> zenoh.Config:
     for endpoint in endpoints:
         checked_endpoint(endpoint)
+    variable = _VARIABLE if os.environ.get(_VARIABLE) == file else ""
+    if file and is_device(file):
+        raise BadConfigurationFile(os.fspath(file), "it is a device, and no file", variable)
     try:
         config = zenoh.Config.from_file(file) if file else zenoh.Config()
     except zenoh.ZError as error:
-        variable = _VARIABLE if os.environ.get(_VARIABLE) == file else ""
         raise BadConfigurationFile(file, redact.reason(error), variable) from None
     for path, value in (session_settings(endpoints) | dict(settings)).items():
         try:

@@ -11,7 +11,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import checked_flag, checked_seconds, of_type
+from factorbus.client.arguments import checked_bound, checked_flag, checked_seconds, of_type
 from factorbus.client.changes import Changes, some_of
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.interest_mirror import InterestMirror
@@ -26,7 +26,7 @@ from factorbus.client.questions import Questions, logged
 from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.client.smoothed_poses import BlendedPose, SmoothedPoses
-from factorbus.client.supported import check_changes, check_interest, check_stamps, check_suspects, check_trusted
+from factorbus.client.supported import check_batch, check_changes, check_interest, check_suspects
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
@@ -66,12 +66,10 @@ class Map:
         self._poses: SmoothedPoses | None = None
         self._lock = threading.RLock()  # entered itself, and not by its condition: see `interruptible_future.py`
         self._changed = threading.Condition(self._lock)
-        self._sending = threading.Lock()
-        self._closed = False
+        self._sending, self._closed = threading.Lock(), False
         self._enter(join())
         self.ask = Questions(sender, self.name, timeout_s)
-        self.uncertainty = Uncertainty(UncertaintyQuestions(sender, self.name, timeout_s))
-        self.marginals = self.uncertainty
+        self.uncertainty = self.marginals = Uncertainty(UncertaintyQuestions(sender, self.name, timeout_s))
 
     def __enter__(self) -> Map:
         return self
@@ -182,15 +180,15 @@ class Map:
         """
         batch, settle = batch_of("batch", batch), checked_flag("settle", settle)
         changes = Changes() if changes is None else of_type("changes", changes, Changes, "a Changes")
-        check_stamps(self._protocol, batch)
-        check_trusted(self._protocol, batch)
+        check_batch(self._protocol, batch)
+        below = checked_bound("convert_below", convert_below)
         timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
                 self._wait_for_room(timeout_s)
             listed = changes.listed_in(self.name, self.epoch)
             check_changes(self._protocol, listed)
-            insert = Insert(self._window.next, batch, settle, self.epoch, convert_below, listed)
+            insert = Insert(self._window.next, batch, settle, self.epoch, below, listed)
             pending_insert = self._pending_insert(insert, timeout_s)
             with self._lock:
                 self._window.sent(pending_insert)
@@ -234,6 +232,7 @@ class Map:
 
         What is unanswered fails with Unavailable: look into the estimate for what the map already has.
         """
+        self._check_open()
         with self._sending:
             self._give_up("the client joined the map anew first; see in the estimate whether it arrived")
             self._enter(self._join())
@@ -323,21 +322,19 @@ class Map:
 
     def open_mirror(self, interest: Interest | None = None) -> None:
         """Start the live estimate, or that of a part, and wait for it.  Raises Unavailable, NotSupported, Refused."""
+        self._check_open()
         if interest is not None:
             check_interest(self._protocol)
             self._mirror = InterestMirror(self._link, self.name, self.timeout_s, interest)
-            self._mirror.start(self._stack)
-            return
-        self._mirror = mirror = Mirror(self._link, self.name, self.timeout_s)
-        row = self._row
-        if row.converged or row.converging:  # neither: the map gave up, and the row does not say why
-            mirror.expect_convergence(row.epoch, row.revision, bool(row.converged), row.converging)
-        mirror.start(self._stack)
+        else:
+            self._mirror, row = Mirror(self._link, self.name, self.timeout_s), self._row
+            if row.converged or row.converging:  # neither: the map gave up, and the row does not say why
+                self._mirror.expect_convergence(row.epoch, row.revision, bool(row.converged), row.converging)
+        self._mirror.start(self._stack)
 
     def watch_owner(self) -> None:
         """Notice when the map's service goes and comes, so that nothing waits longer than it must."""
-        tokens = f"{keys.map_root(self.name)}/live/service/*"
-        self._stack.enter_context(self._link.watching(tokens, self._see_owner))
+        self._stack.enter_context(self._link.watching(f"{keys.map_root(self.name)}/live/service/*", self._see_owner))
 
     def _enter(self, row: MapRow) -> None:
         """Take part in the map as `row` describes it, under a name of our own.
@@ -379,11 +376,14 @@ class Map:
 
     def _wait_for_room(self, timeout_s: float) -> None:
         room = self._changed.wait_for(lambda: self._closed or not self._window.full, timeout_s)
-        if self._closed:
-            raise ClosedHere(f"map {self.name!r}", connection=self._link.closed)
+        self._check_open()
         if not room:
             hint = f"{counted(self._size, 'insert')} without an answer (window={self._size}); this one was not sent"
             raise Unavailable(f"map {self.name!r}", timeout_s, hint)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ClosedHere(f"map {self.name!r}", connection=self._link.closed)
 
     def _give_up(self, hint: str) -> None:
         """Under `_sending`."""

@@ -124,9 +124,9 @@ def fit_into(
 
     Raises KeyCollision, NoAnchor, AbsoluteFactors, CannotMerge, BadSymbol, BadOption.
     """
-    if absolute not in ABSOLUTE:
+    if not isinstance(absolute, str) or absolute not in ABSOLUTE:
         raise CannotMerge(f"absolute is {absolute!r}; wanted one of {', '.join(ABSOLUTE)}")
-    named = of_type("letters", letters or {}, Mapping, 'a mapping of letters, such as {"x": "y"}')
+    named = of_type("letters", {} if letters is None else letters, Mapping, 'a mapping of letters, such as {"x": "y"}')
     given = Batch() if anchors is None else batch_of("anchors", anchors)
     size = _size_of(other.batch)
     renamed = with_letters(other.batch, named)

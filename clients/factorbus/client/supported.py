@@ -17,6 +17,12 @@ def check_changes(protocol: Mapping[str, Any], listed: tuple[Change, ...]) -> No
                 raise NotSupported(f"the change {change.change!r}", str(protocol.get("product", "")))
 
 
+def check_batch(protocol: Mapping[str, Any], batch: Batch) -> None:
+    """Raises NotSupported for fields of variables and factors that a service with this protocol would skip."""
+    check_stamps(protocol, batch)
+    check_trusted(protocol, batch)
+
+
 def check_stamps(protocol: Mapping[str, Any], batch: Batch) -> None:
     """Raises NotSupported where a service with this protocol would skip them."""
     skipped = bool(protocol) and "stamps" not in protocol.get("variable_fields", ())

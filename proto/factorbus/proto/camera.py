@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral, Real
 from types import MappingProxyType
 
 from factorbus.proto.problems import Problem
@@ -21,6 +22,12 @@ _LEAST = MappingProxyType({"pinhole": 4, "radtan": 8, "fisheye": 8, "radial": 7}
 _CODES = MappingProxyType({"radial": 0, "pinhole": 1, "radtan": 1, "fisheye": 2})
 _POSITIVE = frozenset({"fx", "fy", "f", "dx", "dy"})
 _MOST_PIXELS = 1 << 20
+# As of all numbers: beyond these, squares are lost to rounding, or overflow.
+_LARGEST, _SMALLEST = 1e12, 1e-12
+
+
+def _is_size(number: object) -> bool:
+    return isinstance(number, Integral) and not isinstance(number, bool)
 
 
 class BadCamera(Problem):
@@ -51,16 +58,23 @@ class Camera:
     height: int = 0
 
     def __post_init__(self) -> None:
-        if self.model not in MODELS:
+        if not isinstance(self.model, str) or self.model not in MODELS:
             raise BadCamera("model", repr(str(self.model)[:64]), f"one of {', '.join(MODELS)}")
         names = MODELS[self.model]
+        if isinstance(self.numbers, str | bytes) or not hasattr(self.numbers, "__len__"):
+            raise BadCamera(f"numbers of {self.model}", f"{self.numbers!r:.60}", " ".join(names))
         if not _LEAST[self.model] <= len(self.numbers) <= len(names):
             raise BadCamera(f"numbers of {self.model}", counted(len(self.numbers), "number"), " ".join(names))
         for name, number in zip(names, self.numbers, strict=False):
-            if not math.isfinite(number):
-                raise BadCamera(name, number, "a finite number")
+            if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
+                raise BadCamera(name, f"{number!r:.60}", "a finite number")
             if name in _POSITIVE and number <= 0.0:
                 raise BadCamera(name, number, "a number above 0")
+            if abs(number) > _LARGEST or (name in _POSITIVE and number < _SMALLEST):
+                least = f"from {_SMALLEST:g} " if name in _POSITIVE else ""
+                raise BadCamera(name, number, f"a number {least}up to {_LARGEST:g} in magnitude")
+        if not (_is_size(self.width) and _is_size(self.height)):
+            raise BadCamera("image size", f"{self.width!r:.40} × {self.height!r:.40}", "whole numbers of pixels")
         if not (0 <= self.width <= _MOST_PIXELS and 0 <= self.height <= _MOST_PIXELS):
             raise BadCamera("image size", f"{self.width} × {self.height}", "width × height in pixels, or 0 × 0")
         if (self.width == 0) != (self.height == 0):

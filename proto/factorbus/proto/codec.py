@@ -297,4 +297,5 @@ def _read_problem(where: str, content: Mapping[str, Any]) -> Refused:
 
 def _plain(value: Any) -> Any:
     """What MessagePack has no type for, as what it has: a NumPy scalar as its number, anything else as its text."""
-    return value.item() if isinstance(value, np.generic) else str(value)
+    number = value.item() if isinstance(value, np.generic) else None
+    return number if isinstance(number, (bool, int, float)) else str(value)

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import blake2b
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -101,7 +102,7 @@ def channel_of(interest: Interest) -> str:
 def _filter_parts(interest: Interest, where: str) -> tuple[tuple[str, ...], tuple[str, ...], tuple[float, ...]]:
     letters = _words(interest.letters, f"{where}.letters")
     given = interest.kinds
-    kinds = _words([given] if given and isinstance(given, str) else given, f"{where}.kinds")
+    kinds = _words([given] if isinstance(given, str) and given else given, f"{where}.kinds")
     for letter in letters:
         if len(letter) > 1 or (letter and not (letter.isascii() and letter.isalpha())):
             raise BadOption(f"{where}.letters", f"has {letter[:40]!r}", 'ASCII letters, and "" for keys without one')
@@ -124,7 +125,10 @@ def _words(given: Iterable[str], where: str) -> tuple[str, ...]:
 
 def _box(given: Iterable[float], where: str) -> tuple[float, ...]:
     try:
-        box = tuple(float(each) + 0.0 for each in given)  # −0 as 0
+        numbers = tuple(given)
+        if not all(isinstance(each, Real) and not isinstance(each, bool) for each in numbers):
+            raise TypeError  # float would read a text, too
+        box = tuple(float(each) + 0.0 for each in numbers)  # −0 as 0
     except (TypeError, ValueError, OverflowError):
         raise BadOption(where, f"is {given!r:.60}", "4 or 6 numbers") from None
     if len(box) not in (0, 4, 6):

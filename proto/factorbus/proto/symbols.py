@@ -17,9 +17,13 @@ def symbol(letter: str, index: int) -> int:
     """The key of `letter` and `index`: symbol("x", 12) prints as x12.  Raises BadSymbol."""
     if not isinstance(letter, str) or len(letter) > 1 or (letter and not (letter.isascii() and letter.isalpha())):
         raise BadSymbol(f"{letter}{index}", "one ASCII letter")
-    if not hasattr(index, "__index__") or not 0 <= operator.index(index) <= MAX_INDEX:
+    try:
+        number = operator.index(index)
+    except TypeError:  # an array has the method, and is no index
+        number = -1
+    if not 0 <= number <= MAX_INDEX:
         raise BadSymbol(f"{letter}{index}", f"an index from 0 to {MAX_INDEX}")
-    return (ord(letter) << _INDEX_BITS if letter else 0) | operator.index(index)
+    return (ord(letter) << _INDEX_BITS if letter else 0) | number
 
 
 def parse_symbol(text: str) -> int:

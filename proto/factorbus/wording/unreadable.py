@@ -1,6 +1,18 @@
-"""What to do about a file that cannot be read, for a person."""
+"""What to do about a file that cannot be read, for a person; and which is none."""
+
+import os
+import stat
 
 _OTHERWISE = "look whether its disk is there and sound"
+
+
+def is_device(path: str | os.PathLike[str]) -> bool:
+    """Whether reading it may have no end, as that of /dev/zero; a pipe has one."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):  # who reads it says so
+        return False
+    return stat.S_ISCHR(mode) or stat.S_ISBLK(mode)
 
 
 def mend_of(error: OSError) -> str:

@@ -1,12 +1,16 @@
 """From a file to its lines, in buckets by the name of the record."""
 
 import gzip
+import re
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from factorbus.formats.errors import FormatError
-from factorbus.wording.unreadable import mend_of
+from factorbus.wording.unreadable import is_device, mend_of
+
+# Behind a point and before one of these it is a number that is none, as Microsoft's compilers have printed them.
+_COMMENT = re.compile(rb"(?<!\.)#|#(?!INF|IND|QNAN|SNAN)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +22,9 @@ class Bucket:
 
 
 def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
-    """The lines of `content` by record, in the order of the file; blank lines and what follows a # are left out.
+    """The lines of `content` by record, in the order of the file; blank lines and comments are left out.
 
+    A comment begins with a #; that of 1.#INF, as some compilers print an infinity, begins none.
     Raises FormatError when it is not text or has no record.
     """
     if b"\0" in content:
@@ -27,7 +32,7 @@ def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
         raise FormatError(file, line, "a zero byte", "a text file in ASCII or UTF-8")
     found: dict[bytes, Bucket] = {}
     for number, line in enumerate(content.split(b"\n"), 1):
-        name, *rest = line.partition(b"#")[0].split(None, 1) or (b"",)
+        name, *rest = _uncommented(line).split(None, 1) or (b"",)
         if not name:
             continue
         bucket = found.get(name)
@@ -40,9 +45,17 @@ def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
     return {name.decode("utf-8", "backslashreplace"): bucket for name, bucket in found.items()}
 
 
+def _uncommented(line: bytes) -> bytes:
+    """`line` up to its comment."""
+    found = _COMMENT.search(line) if b"#" in line else None
+    return line[: found.start()] if found else line
+
+
 def read_content(path: Path) -> bytes:
     """The bytes of the file, unpacked where it is a gzip file, without a byte order mark.  Raises FormatError."""
     try:
+        if is_device(path):
+            raise FormatError(str(path), None, "a device", "a file, or a pipe such as /dev/stdin behind one")
         content = path.read_bytes()
         if content.startswith(b"\x1f\x8b"):
             content = gzip.decompress(content)

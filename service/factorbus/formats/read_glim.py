@@ -42,8 +42,11 @@ def is_glim(path: Path) -> bool:
     """Whether it is the folder of such a map, or the graph.txt in it; by their names alone, to say what it lacks."""
     if (path / GRAPH_TEXT).is_file() and (path / GRAPH_BINARY).is_file():
         return True
+    index = path / GRAPH_TEXT if path.is_dir() else path
+    if not index.is_file():  # what is read from a pipe is not there again
+        return False
     try:
-        with (path / GRAPH_TEXT if path.is_dir() else path).open("rb") as text:
+        with index.open("rb") as text:
             return is_glim_text(text.read(64))
     except OSError:
         return False

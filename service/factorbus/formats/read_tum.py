@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from factorbus.formats.errors import FormatError
 from factorbus.formats.graph import GraphFile
 from factorbus.formats.lines import Bucket
 from factorbus.formats.numbers import read_numbers
@@ -15,6 +16,7 @@ from factorbus.proto.symbols import symbol
 
 TUM = "tum"
 _POSE = "TUM pose"
+_KITTI = 12  # numbers of a pose there: the upper three rows of a matrix
 
 
 def is_trajectory(buckets: Mapping[str, Bucket]) -> bool:
@@ -34,6 +36,8 @@ def read_trajectory(file: str, buckets: Mapping[str, Bucket]) -> GraphFile:
         for time, bucket in buckets.items()
         for line, rest in zip(bucket.numbers, bucket.rests, strict=True)
     )
+    if all(len(rest.split()) == _KITTI - 1 for _, _, rest in rows):
+        raise FormatError(file, rows[0][0], "a KITTI pose, which is written and not read", "a graph, or TUM's poses")
     poses = Bucket([rest for _, _, rest in rows], [line for line, _, _ in rows])
     stamps = np.array([nanoseconds(file, line, time) for line, time, _ in rows], np.int64)
     _, values = read_numbers(file, _POSE, poses, 0, 7, "tx ty tz qx qy qz qw after the time")

@@ -43,6 +43,21 @@ def positive_definite(packed: F64, dim: int) -> NDArray[np.bool]:
     return good
 
 
+def has_covariance(packed: F64, dim: int) -> NDArray[np.bool]:
+    """Whether the inverse of each information is one that a double holds, and leads back to an information.
+
+    in   packed (n, dim (dim + 1) / 2)   out  (n,) bool
+    """
+    with np.errstate(all="ignore"):
+        try:
+            covariance = inverted_weights(packed, dim)
+            return positive_definite(covariance, dim) & positive_definite(inverted_weights(covariance, dim), dim)
+        except np.linalg.LinAlgError:  # one of them is singular after rounding: which one is not said
+            if len(packed) == 1:
+                return np.zeros(1, bool)
+            return np.concatenate([has_covariance(row[None], dim) for row in packed])
+
+
 def squared(root: F64, dim: int) -> F64:
     """RᵀR of upper triangular matrices R, packed as they are.
 
@@ -55,7 +70,7 @@ def squared(root: F64, dim: int) -> F64:
 def inverted_weights(packed: F64, dim: int) -> F64:
     """Information of covariances, or the other way round; both packed (n, dim (dim + 1) / 2)."""
     full = np.linalg.inv(unpacked_symmetric(packed, dim))
-    return packed_upper((full + np.swapaxes(full, 1, 2)) / 2)
+    return packed_upper(full / 2 + np.swapaxes(full, 1, 2) / 2)
 
 
 def doubled_rotations(packed: F64) -> F64:

@@ -8,8 +8,9 @@ import numpy as np
 
 from factorbus.formats.errors import FormatError
 from factorbus.formats.left_out import LeftOut, shown
+from factorbus.formats.weights import has_covariance
 from factorbus.proto.arrays import I64
-from factorbus.proto.kinds import name_of_kind
+from factorbus.proto.kinds import FACTOR_KINDS, name_of_kind
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.roles import FRAME, MOUNT, keys_of_role, pick_factors, pick_variables
 from factorbus.proto.stamps import NO_STAMP
@@ -19,6 +20,8 @@ from factorbus.proto.symbols import format_symbol
 _Lost = Counter[tuple[str, str]]
 # Poses that are no places in the map: their role, what they are called, and what there is no record for.
 _ASIDE = ((MOUNT, "mounts", "where a sensor is on a robot"), (FRAME, "frames", "where the map is in another frame"))
+
+_NO_COVARIANCE = "the information matrix has no inverse within what a double holds"
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +38,7 @@ class Form:
     """A form of file: its name, the kinds of variables it has, and of factors with how many numbers are measured.
 
     timed: the kinds of variables whose time it has.  fixes: whether it says which variables are fixed.
+    covariances: whether it has covariances in place of information matrices.
     """
 
     name: str
@@ -42,6 +46,7 @@ class Form:
     measured: Mapping[str, int]
     timed: frozenset[str] = frozenset()
     fixes: bool = True
+    covariances: bool = False
 
 
 def writable(batch: Batch, form: Form, left: LeftOut) -> Batch:
@@ -85,6 +90,10 @@ def _writable_factors(group: Factors, gone: I64, form: Form, lost: _Lost) -> Fac
     if group.kind in ("position_se2", "position_se3"):
         kept = (group.measured[:, form.measured[group.kind] :] == 0.0).all(axis=1)
         lost[group.kind, f"{form.name} has no record for an antenna beside its pose"] += int((~kept).sum())
+    if form.covariances:
+        certain = has_covariance(group.information, FACTOR_KINDS[group.kind].dim)
+        lost[group.kind, _NO_COVARIANCE] += int((kept & ~certain).sum())
+        kept = kept & certain
     if group.loss:
         why = f"{form.name} has no losses: written without their {group.loss}"
         lost[f"{group.kind} loss", why] += len(group.keys)

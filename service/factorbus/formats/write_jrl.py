@@ -37,6 +37,7 @@ _FORM = Form(
     {kind: FACTOR_KINDS[kind].size for kind in _FACTOR_NAMES},
     frozenset(_VALUE_NAMES),
     fixes=False,
+    covariances=True,
 )
 _NOBODY = "a"  # the robot of keys without a letter
 CBOR = ".cbor"  # the ending of a file that is coded so

@@ -29,6 +29,7 @@ _FORM = Form(
     {kind: FACTOR_KINDS[kind].size for kind in _FACTOR_NAMES},
     frozenset(record.kind for record in VERTICES.values() if record.timed),
     fixes=False,
+    covariances=True,
 )
 
 

@@ -15,6 +15,7 @@ from factorbus.proto.keep import KEEP_ALL, keep_text
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import MessageLimits
 from factorbus.proto.problems import Problem
+from factorbus.wording.unreadable import is_device
 
 _THIS_HOST = ("127.0.0.1", "localhost", "[::1]", "0.0.0.0", "[::]")
 _HOST_PORT = re.compile(r"(?:\[[0-9a-fA-F:]+\]|[^\s:/]+):\d{1,5}")
@@ -110,6 +111,8 @@ class Config:
 
 def load_config(path: str | Path, **overrides: Any) -> Config:
     """The configuration in the TOML file `path`; `overrides` win.  Raises BadConfig, BadEndpoint, BadName, OSError."""
+    if is_device(path):
+        raise BadConfig(f"{path} is a device; wanted a file in TOML")
     with Path(path).open("rb") as file:
         try:
             content = tomllib.load(file)

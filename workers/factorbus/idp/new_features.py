@@ -1,6 +1,5 @@
 """From pixels to features: checks at the door, then the kernel.  MATH §3, §4."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +17,8 @@ _REASONS = {
     at.OUTSIDE_IMAGE: "outside the image",
     at.VERTICAL: "its ray runs along the world's y axis, where azimuth has no meaning",
 }
+# As in maps: beyond these, squares are lost to rounding or overflow, and the answer would have infinities.
+_LARGEST, _LEAST_SIGMA, _LARGEST_COVARIANCE = 1e12, 1e-12, 1e24
 # P may be asymmetric by rounding, not by meaning.
 _ASYMMETRY = 1e-9
 
@@ -84,9 +85,15 @@ def _check(observations: Observations) -> None:
         raise BadState(
             "state", str(observations.state.tolist())[:120], "13 finite numbers with a quaternion q0 qx qy qz"
         )
+    if (largest := float(np.abs(observations.state).max())) > _LARGEST:
+        raise BadState("state", f"as large as {largest:.3g}", f"numbers up to {_LARGEST:g} in magnitude")
     own = observations.covariance[:, :CAMERA_STATE]
     if not np.isfinite(observations.covariance).all():
         raise BadState("covariance", "not finite everywhere", "finite numbers")
+    if (largest := float(np.abs(observations.covariance).max())) > _LARGEST_COVARIANCE:
+        raise BadState(
+            "covariance", f"as large as {largest:.3g}", f"numbers up to {_LARGEST_COVARIANCE:g} in magnitude"
+        )
     if not (np.diag(own) >= 0.0).all():
         raise BadState("covariance", f"negative on its diagonal: {np.diag(own).min():.3g}", "variances")
     if (worst := abs(own - own.T).max()) > _ASYMMETRY * abs(own).max():
@@ -94,9 +101,9 @@ def _check(observations: Observations) -> None:
 
 
 def _check_prior(observations: Observations) -> None:
-    if not math.isfinite(observations.rho):
-        raise BadState("rho", observations.rho, "a finite inverse distance, 1/metre")
+    if not abs(observations.rho) <= _LARGEST:
+        raise BadState("rho", observations.rho, f"an inverse distance, 1/metre, up to {_LARGEST:g} in magnitude")
     for name in ("sigma_rho", "sigma_pixel"):
         sigma = getattr(observations, name)
-        if not (math.isfinite(sigma) and sigma > 0.0):
-            raise BadState(name, sigma, "a standard deviation above 0")
+        if not _LEAST_SIGMA <= sigma <= _LARGEST:
+            raise BadState(name, sigma, f"a standard deviation from {_LEAST_SIGMA:g} to {_LARGEST:g}")

@@ -21,6 +21,7 @@ from factorbus.proto import codec, keys, redact
 from factorbus.proto.messages import JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.solver.errors import SolverError
+from factorbus.wording.unreadable import is_device
 from factorbus.workers import jobs
 from factorbus.workers.config import BadConfig, WorkerConfig, checked_worker_config
 from factorbus.workers.heap import keep_freed_memory
@@ -91,6 +92,8 @@ def _settings(config: WorkerConfig) -> zenoh.Config:
         "transport/link/tx/lease": 3000,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
     }
+    if config.zenoh and is_device(config.zenoh):
+        raise BadConfig(f"the Zenoh configuration {config.zenoh} is a device; wanted a file")
     try:
         settings = zenoh.Config.from_file(config.zenoh) if config.zenoh else zenoh.Config()
         for path, value in paths.items():

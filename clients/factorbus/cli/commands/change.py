@@ -164,13 +164,10 @@ def adopt_command(address: MapAddress, as_json: bool) -> int:
     factorbus change fork warehouse as-it-was
     factorbus change adopt warehouse
     """
+    from factorbus.cli.process.bus import joined_map
     from factorbus.client import Changes
-    from factorbus.client import connect as open_bus
 
-    with (
-        open_bus(address.endpoint, client="change", zenoh=address.zenoh, timeout_s=address.timeout_s) as bus,
-        bus.map(address.name, mirror=False, create=False) as joined,
-    ):
+    with joined_map(address, "change") as joined:
         found = joined.chi2(batch=True, values=True, timeout_s=address.timeout_s)
         better = found.notice is not None
         accepted = joined.change(Changes().adopt(found), settle=True, timeout_s=address.timeout_s) if better else None

@@ -8,7 +8,7 @@ import click
 
 from factorbus.cli.output.advice import MERGING, advising
 from factorbus.cli.output.console import document, table
-from factorbus.cli.output.exits import OK
+from factorbus.cli.output.exits import OK, input_file
 from factorbus.cli.process.options import MapAddress, grouped
 from factorbus.wording import counted
 
@@ -82,7 +82,7 @@ def merge_command(address: MapAddress, other: str, merging: MergeOptions, settle
     sigmas, file, found = merging.sigmas, merging.candidates, None
     if file is not None and (merging.anchors or merging.frame):
         raise click.UsageError("--align finds out what --anchor and --frame say; give one of them")
-    candidates = None if file is None else read_candidates(file, sigmas)
+    candidates = None if file is None else readread_candidates(file, sigmas)
     how: dict[str, Any] = {
         "letters": dict(_pair("--letter", each, "x=y") for each in merging.letters),
         "anchors": _draft(merging.anchors, sigmas) if merging.anchors else None,
@@ -131,14 +131,12 @@ def _show(merged: Any, found: Any, as_json: bool) -> None:
 
 
 def read_candidates(file: Path, sigmas: str | None) -> Any:
-    """Of each line a relative pose.  Raises UsageError."""
+    """Of each line a relative pose.  Raises UsageError, Stopped."""
     from factorbus.client import Draft
 
     draft, usual = Draft(), None if sigmas is None else _numbers("--sigmas", sigmas)
-    try:
+    with input_file(file):
         text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as problem:
-        raise click.UsageError(f"{file}: {problem}; wanted a text file, a line for each candidate") from problem
     for number, line in enumerate(text.splitlines(), 1):
         fields = line.partition("#")[0].split()
         if not fields:

@@ -12,7 +12,7 @@ import click
 from factorbus.cli.output.console import document
 from factorbus.cli.output.installing import install_command
 from factorbus.proto.problems import Refused
-from factorbus.wording.unreadable import mend_of
+from factorbus.wording.unreadable import is_device, mend_of
 
 OK, FAILED, USAGE, BAD_FILE, UNAVAILABLE, REFUSED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
 
@@ -71,6 +71,8 @@ def report(error: Exception, as_json: bool, debug: bool) -> int:
 @contextmanager
 def input_file(path: Path) -> Iterator[None]:
     """Turns what goes wrong in reading `path` into the exit code for a bad file.  Raises Stopped."""
+    if is_device(path):
+        raise Stopped("bad_file", f"{path} cannot be read: it is a device; name a file", BAD_FILE, path=str(path))
     try:
         yield
     except UnicodeDecodeError as error:

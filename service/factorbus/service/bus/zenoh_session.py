@@ -24,6 +24,7 @@ from factorbus.service.bus.zenoh_config import RUNTIME, RUNTIME_VARIABLE, upstre
 from factorbus.service.config import BadConfig, Config
 from factorbus.service.core.events import Asker
 from factorbus.service.jobs.job_check import WrongAnswer
+from factorbus.wording.unreadable import is_device
 
 log = logging.getLogger(__name__)
 
@@ -76,6 +77,8 @@ def _upstream_settings(endpoint: str, zenoh_file: str) -> zenoh.Config:
 
 
 def _settings(file: str, ours: Mapping[str, Any]) -> zenoh.Config:
+    if file and is_device(file):
+        raise BadConfig(f"the Zenoh configuration {file} is a device; wanted a file")
     try:
         settings = zenoh.Config.from_file(file) if file else zenoh.Config()
         for path, value in ours.items():
