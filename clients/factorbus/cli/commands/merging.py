@@ -82,7 +82,7 @@ def merge_command(address: MapAddress, other: str, merging: MergeOptions, settle
     sigmas, file, found = merging.sigmas, merging.candidates, None
     if file is not None and (merging.anchors or merging.frame):
         raise click.UsageError("--align finds out what --anchor and --frame say; give one of them")
-    candidates = None if file is None else readread_candidates(file, sigmas)
+    candidates = None if file is None else read_candidates(file, sigmas)
     how: dict[str, Any] = {
         "letters": dict(_pair("--letter", each, "x=y") for each in merging.letters),
         "anchors": _draft(merging.anchors, sigmas) if merging.anchors else None,
