@@ -36,6 +36,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import zenoh
 from bus import session
+from process_memory import resident
 from processes import processes
 from zenoh.handlers import Callback
 
@@ -48,7 +49,6 @@ from factorbus.simulate import WORLDS
 WARM_UP = 60  # poses
 PATIENCE_S = 300.0  # of one step: where a whole map moves, on a machine with other work
 CPUCLOCK_SCHED = 2
-PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 class Viewer:
@@ -141,11 +141,6 @@ def service() -> Iterator[tuple[str, int]]:
     with tempfile.TemporaryDirectory() as folder, processes(Path(folder)) as start:
         process = start("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0")
         yield process.ready()[0], process.pid
-
-
-def resident(pid: int) -> int:
-    """Bytes of a process that are in memory."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE
 
 
 def cpu_seconds(pid: int) -> float:

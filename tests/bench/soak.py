@@ -31,6 +31,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from process_memory import resident
 from processes import Process, processes
 
 from factorbus.client import Bus, Draft, connect
@@ -267,15 +268,11 @@ def _close(bus: Bus, name: str, letters: str, folder: Path, account: Account, pi
     present = {int(key) for group in estimate.variables for key in group.keys}
     account.close(name, letters, folder, folder / "journal", present, factors)
     bus.drop(name, timeout_s=_PATIENCE_S)
-    account.memory.append((account.answered, _resident(pid)))
+    account.memory.append((account.answered, resident(pid)))
     print(
         f"{name}: {account.answered} answered, {account.lost} lost, {account.duplicated} twice, "
         f"{account.memory[-1][1] / 1e6:.1f} MB", file=sys.stderr, flush=True,
     )  # fmt: skip
-
-
-def _resident(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def main() -> int:

@@ -11,7 +11,7 @@ from factorbus.journal.store import Store, create
 from factorbus.proto import codec
 from factorbus.proto.closures import decode_suspects
 from factorbus.proto.keep import keep_text
-from factorbus.proto.messages import Batch, Insert, Variables
+from factorbus.proto.messages import Batch, Change, Insert, Variables
 from factorbus.proto.own_clients import KEEPER
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Arrived
@@ -20,6 +20,7 @@ from factorbus.service.journal.recovery import recover, verify
 from factorbus.service.journal.writing import written
 from factorbus.service.solving.arrival import message_digest
 from factorbus.simulate import manhattan
+from factorbus.solver.closures.judging import COMPARED
 
 EPOCH = 7
 KEEP = keep_text("per_area=2,window=20")
@@ -35,9 +36,9 @@ class Kept:
         self.store: Store = create(folder, "m", "bayes-tree", self.map_solver.options(), EPOCH, "none")
         self.removed = self.plans = self.number = 0
 
-    def insert(self, batch: Batch) -> None:
+    def insert(self, batch: Batch, changes: tuple[Change, ...] = ()) -> None:
         self.number += 1
-        content = Insert(self.number, batch)
+        content = Insert(self.number, batch, changes=changes)
         message = codec.encode_insert(content)
         self.apply(Arrived([], "a", self.number, 0, len(message), message_digest(message), content, 0.0, message))
 
@@ -124,3 +125,24 @@ def test_poses_of_a_closure_that_is_out_stay(tmp_path: Path) -> None:
     graph = made.map_solver._solver.factor_graph
     assert graph.find(10) >= 0 <= graph.find(31)
     assert decode_suspects(made.map_solver.suspects(False)).keys.tolist() == [[10, 31]]
+
+
+def test_poses_of_closures_that_no_new_one_is_compared_with_and_of_rejected_ones_go(tmp_path: Path) -> None:
+    """A robot that closes false loops for years would have all their poses."""
+    made = Kept(tmp_path / "m", "test")
+    made.insert(Batch((Variables("se2", np.array([0]), np.zeros((1, 3)), True),)))
+    count = COMPARED + 40
+    for k in range(1, 2 * count + 40):
+        made.insert(Batch((Variables("se2", np.array([k])),), (between(k - 1, k, [0.2, 0.0, 0.0]),)))
+    for k in range(count):
+        made.insert(Batch((), (between(2 * k, 2 * k + 7, [0.0, 3.0 + k % 7, 0.5]),)))
+    closures = decode_suspects(made.map_solver.suspects(False))
+    assert len(closures.factors) == count
+    made.insert(Batch(), (Change("reject", closures.factors[-3:]),))
+    made.keep()
+    graph = made.map_solver._solver.factor_graph
+    left = decode_suspects(made.map_solver.suspects(False)).keys.tolist()
+    suspects = [pair for pair in closures.keys.tolist()[:-3] if min(graph.find(key) for key in pair) >= 0]
+    assert [pair for pair in left if pair in suspects] == suspects
+    assert COMPARED <= len(suspects) < COMPARED + 5
+    assert len(left) < count - 30

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bare import INFORMATION
+from process_memory import resident
 from processes import Process
 
 from factorbus.client import connect
@@ -39,10 +40,6 @@ def fill(driven: Map) -> tuple[int, Refused]:
         except Refused as refused:
             return n, refused
     raise AssertionError("a million poses, and no refusal")
-
-
-def resident(process_id: int) -> int:
-    return int(Path(f"/proc/{process_id}/statm").read_text().split()[1]) * 4096
 
 
 def test_it_refuses_before_the_limit_and_takes_again_after_a_drop(tmp_path: Path, spawn: Spawn) -> None:

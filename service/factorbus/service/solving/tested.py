@@ -42,8 +42,8 @@ from factorbus.service.kernels.digest import digest
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.asked import AskedChanges, asked_changes
 from factorbus.solver.closures.ahead import StagedBatch, enter_closures, stage_with_believed
-from factorbus.solver.closures.judging import ClosureJudge
-from factorbus.solver.closures.ledger import NEW, NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts
+from factorbus.solver.closures.judging import COMPARED, ClosureJudge
+from factorbus.solver.closures.ledger import NEW, NO_VERDICTS, SUSPECT, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.closures.loops import SplitFactors, TrustedForest, has_candidates
 from factorbus.solver.closures.switching import note_switch, planned_switch
 from factorbus.solver.errors import SolverError
@@ -153,8 +153,8 @@ class TestedMapSolver(MapSolver):
         return same
 
     def _staying(self) -> I64:
-        """A closure that is out may go in again: its poses stay."""
-        return np.array([key for c in self._ledger.closures if not c.is_in for key in c.keys], np.int64)
+        """Of suspects with which new closures may agree the poses stay; older ones and rejected ones go with theirs."""
+        return np.array([c.keys for c in self._ledger.closures if c.state == SUSPECT][-COMPARED:], np.int64).ravel()
 
     def closure_counts(self) -> dict[str, int]:
         """How many are in each state."""

@@ -60,6 +60,7 @@ from factorbus.solver.solver import Solver
 
 CONTRADICTED = "contradicted"
 _NEWEST = 40  # suspects, or accepted ones, among which places are looked for
+COMPARED = 4 * _NEWEST  # of the newest suspects, with which new closures may agree
 _BELIEVED = {PASSED, AGREES}
 _PLANE_DIM, _SPACE_DIM = 3, 6
 _MOST_COUNTED = 256  # improbable ones
@@ -193,7 +194,7 @@ class ClosureJudge:
         count = len(ledger.closures)
         others = ledger.is_suspect[:count] & ~ledger.is_new[:count]
         if new.size:
-            among = np.flatnonzero(others)[-4 * _NEWEST :]
+            among = np.flatnonzero(others)[-COMPARED:]
             is_improbable = ledger.is_improbable[among]
             companions = self._companions(solver, ledger, new, np.ascontiguousarray(among[is_improbable][::-1]))
             if companions.size + new.size < LEAST_RIVALS:
