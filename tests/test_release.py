@@ -1,6 +1,8 @@
 """What is uploaded: README's links lead somewhere from the package's page; a release that lacks something says so."""
 
+import hashlib
 import importlib.util
+import json
 import os
 import re
 import subprocess
@@ -14,14 +16,76 @@ ROOT = Path(__file__).parents[1]
 URL = "https://example.org/somebody/factorbus"
 
 
-@pytest.fixture(scope="module")
-def urls() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("project_urls", ROOT / "deploy/release/project_urls.py")
+def loaded(name: str) -> ModuleType:
+    """A script of the release as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"deploy/release/{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def urls() -> ModuleType:
+    return loaded("project_urls")
+
+
+@pytest.mark.parametrize("words", [[], ["python3"], ["python3", "out", "--reharse"], ["python3", "out", "", "more"]])
+def test_words_that_are_not_known_are_refused_before_anything_is_built(words: list[str], tmp_path: Path) -> None:
+    """Of --reharse would have come a release, with a signed tag."""
+    command = ["bash", str(ROOT / "deploy/release/release.sh"), *words]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (ran.returncode, ran.stdout, list(tmp_path.iterdir())) == (2, "", [])
+    assert ran.stderr == f"wanted: deploy/release/release.sh PYTHON FOLDER [--rehearse], seen: {' '.join(words)}\n"
+
+
+def test_the_bill_of_materials_is_of_this_version_and_not_of_the_environment() -> None:
+    """As cyclonedx-py writes it: a subject without a version, and what every environment has."""
+    bill = {
+        "metadata": {"component": {"bom-ref": "root-component", "name": "factorbus", "type": "library"}, "tools": 1},
+        "components": [{"bom-ref": f"{name}==1", "name": name} for name in ("numpy", "pillow", "pip", "setuptools")],
+        "dependencies": [
+            {"ref": "root-component", "dependsOn": ["numpy==1", "pillow==1"]},
+            {"ref": "pillow==1", "dependsOn": ["numpy==1", "setuptools==1"]},
+            {"ref": "setuptools==1", "dependsOn": ["pip==1"]},
+            {"ref": "numpy==1"},
+            {"ref": "pip==1"},
+        ],
+    }
+    made = loaded("bill_of_materials").completed(bill, "1.2.3")
+    subject = made["metadata"]["component"]
+    assert (subject["version"], subject["purl"]) == ("1.2.3", "pkg:pypi/factorbus@1.2.3")
+    assert made["metadata"]["tools"] == 1
+    assert [each["name"] for each in made["components"]] == ["numpy", "pillow"]
+    assert made["dependencies"] == [
+        {"ref": "root-component", "dependsOn": ["numpy==1", "pillow==1"]},
+        {"ref": "pillow==1", "dependsOn": ["numpy==1"]},
+        {"ref": "numpy==1"},
+    ]
+
+
+def test_the_provenance_leads_to_the_source_and_has_the_hash_of_each_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("factorbus-1.2.3-py3-none-any.whl", "factorbus-1.2.3.tar.gz", "factorbus-1.2.3.cdx.json"):
+        (tmp_path / name).write_text(name)
+    provenance = loaded("provenance")
+    monkeypatch.setattr(provenance, "version", lambda _: "9")  # what builds is not installed here
+    said = {}
+    for url in ("", f"{URL}/"):
+        monkeypatch.setenv("FACTORBUS_URL", url)
+        provenance.main(str(ROOT), str(tmp_path), "1.2.3")
+        said[url] = json.loads(capsys.readouterr().out)
+    subjects = {each["name"]: each["digest"]["sha256"] for each in said[""]["subject"]}
+    packages = [each for each in tmp_path.iterdir() if each.suffix != ".json"]
+    assert subjects == {each.name: hashlib.sha256(each.read_bytes()).hexdigest() for each in packages}
+    source = said[f"{URL}/"]["predicate"]["buildDefinition"]["resolvedDependencies"][0]
+    assert source["uri"] == f"git+{URL}@refs/tags/v1.2.3"
+    assert re.fullmatch(r"[0-9a-f]{40}", source["digest"]["gitCommit"])
+    builder = said[f"{URL}/"]["predicate"]["runDetails"]["builder"]["id"]
+    assert builder == f"{URL}/blob/v1.2.3/deploy/release/release.sh"
+    assert said[""]["predicate"]["buildDefinition"]["resolvedDependencies"][0]["uri"] == "git+file:factorbus"
 
 
 def test_each_link_of_readme_leads_to_a_file_of_the_tag(urls: ModuleType) -> None:

@@ -11,7 +11,11 @@
 set -euo pipefail
 
 main() {
-    [ $# -ge 2 ] || { sed -n 's/^# *//; /release.sh PYTHON/p' "${BASH_SOURCE[0]}" >&2; return 2; }
+    # A word that is not known is refused: what was meant to be a rehearsal would sign and tag.
+    if [ $# -lt 2 ] || [ $# -gt 3 ] || [ "${3:---rehearse}" != --rehearse ]; then
+        echo "wanted: deploy/release/release.sh PYTHON FOLDER [--rehearse], seen: $*" >&2
+        return 2
+    fi
     python=$1 out=$2 rehearse=${3:-}
     here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
     root=$(cd "$here/../.." && pwd)
@@ -30,7 +34,7 @@ main() {
     describe
     try_them
     bill_of_materials
-    "$work/tools/bin/python" "$here/provenance.py" "$root" "$out" > "$out/factorbus-$version.provenance.json"
+    "$work/tools/bin/python" "$here/provenance.py" "$root" "$out" "$version" > "$out/factorbus-$version.provenance.json"
     (cd "$out" && sha256sum factorbus-* > SHA256SUMS)
     [ "$rehearse" = --rehearse ] || sign
     echo "release: $version of $(git rev-parse --short HEAD) is in $out"
@@ -107,6 +111,7 @@ find_python() {
 bill_of_materials() {
     "$work/tools/bin/cyclonedx-py" environment --output-reproducible --mc-type library --pyproject pyproject.toml \
         --output-file "$out/factorbus-$version.cdx.json" "$newest/bin/python"
+    "$work/tools/bin/python" "$here/bill_of_materials.py" "$out/factorbus-$version.cdx.json" "$version"
 }
 
 sign() {

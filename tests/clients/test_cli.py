@@ -311,3 +311,7 @@ def test_doctor_fails_where_kernels_cannot_be_kept(tmp_path: Path) -> None:
 def test_warm_says_how_long(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["warm"]) == OK
     assert re.search(r"kernels ready in \d+\.\d s", capfd.readouterr().out)
+    assert main(["warm", "--json"]) == OK
+    document = json.loads(capfd.readouterr().out)
+    assert set(document) == {"seconds", "compiling_seconds", "compiled"}
+    assert document["compiled"] == [], "the second time it only loads them"

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import click
 import numpy as np
@@ -11,19 +12,32 @@ import pytest
 from factorbus.cli.main import cli, main
 from factorbus.cli.output.exits import FAILED, USAGE, Stopped, report
 
+ROOT = Path(__file__).resolve().parents[2]
+# Those that run until they are stopped: there is nothing to say at the end.
+STAY = {("serve",), ("work",), ("gateway",), ("watch",), ("record",), ("ros2",)}
 
-def with_json(group: click.Group, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The words of all commands that have --json."""
+
+def commands_of(group: click.Group, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    """All commands, with their words."""
     context = click.Context(group)
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         if isinstance(command, click.Group):
-            yield from with_json(command, (*words, name))
-        elif command is not None and any("--json" in each.opts for each in command.params):
-            yield *words, name
+            yield from commands_of(command, (*words, name))
+        elif command is not None:
+            yield (*words, name), command
 
 
-COMMANDS = sorted(with_json(cli))
+ALL = dict(commands_of(cli))
+COMMANDS = sorted(words for words, command in ALL.items() if any("--json" in each.opts for each in command.params))
+
+
+def test_all_that_end_have_it() -> None:
+    assert set(ALL) - set(COMMANDS) == STAY
+    page = (ROOT / "docs/reference/commands.md").read_text()
+    said = page[page.index("`--json` prints") : page.index("[commands]")]
+    assert all(f"`{name}`" in said for (name,) in STAY)
+    assert not any("--log" in each.opts for name in ("gateway", "watch", "record") for each in ALL[name,].params)
 
 
 def test_there_are_many() -> None:

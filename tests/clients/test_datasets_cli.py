@@ -70,6 +70,9 @@ def test_fetching_a_real_one_from_a_mirror(
     capsys.readouterr()
     assert main(["datasets", "path", "manhattan3500"]) == 0
     assert capsys.readouterr().out == f"{cache / 'manhattan3500.g2o'}\n"
+    assert main(["datasets", "path", "manhattan3500", "--json"]) == 0
+    path = str(cache / "manhattan3500.g2o")
+    assert json.loads(capsys.readouterr().out) == {"name": "manhattan3500", "path": path}
 
 
 def test_one_failure_does_not_stop_the_others(

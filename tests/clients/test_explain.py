@@ -1,6 +1,7 @@
 """Every code that the source can give has a page."""
 
 import ast
+import json
 import re
 from pathlib import Path
 
@@ -61,6 +62,18 @@ def test_explain_says_it_and_guesses(capsys: pytest.CaptureFixture[str]) -> None
     assert said.startswith("underconstrained\n\nThe factors leave a variable free to move")
     assert main(["explain", "underconstraind"]) == USAGE
     assert "did you mean underconstrained" in capsys.readouterr().err
+
+
+def test_what_scripts_read_is_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", "NotConverged", "--json"]) == OK
+    pages = read_pages()
+    assert json.loads(capsys.readouterr().out) == {"code": "not_converged", "text": pages["not_converged"]}
+    assert main(["explain", "--json"]) == OK
+    codes = json.loads(capsys.readouterr().out)["codes"]
+    assert set(codes) == set(pages)
+    assert all(" ".join(pages[name].split()).startswith(text) for name, text in codes.items())
+    assert main(["explain", "nope", "--json"]) == USAGE
+    assert json.loads(capsys.readouterr().out)["problem"]["code"] == "unknown_code"
 
 
 def test_the_list_has_whole_sentences(capsys: pytest.CaptureFixture[str]) -> None:

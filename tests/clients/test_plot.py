@@ -1,5 +1,6 @@
 """`factorbus plot`: what the pictures show is so, and how the command ends."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -140,7 +141,8 @@ def test_pictures_of_a_file(arguments: list[str], town: Path, tmp_path: Path, ca
     assert said == [f"town-{arguments[0]}.png"]
     assert (tmp_path / said[0]).read_bytes().startswith(b"\x89PNG")
     svg = tmp_path / "picture.svg"
-    assert main(["plot", *arguments, str(town), "--out", str(svg)]) == OK
+    assert main(["plot", *arguments, str(town), "--out", str(svg), "--json"]) == OK
+    assert json.loads(capsys.readouterr().out) == {"files": [str(svg)]}
     text = svg.read_text()
     assert {"map": "odometry alone", "drive": "relinearized", "sparsity": "fill-in", "tree": "last loop"}[
         arguments[0]

@@ -191,6 +191,30 @@ def detections(ns: int, frame: str, seen: list[tuple[str, tuple[float, float, fl
     return words.Detection3DArray(words.Header(stamp(ns), frame), made)
 
 
+def landmark_list(ns: int, frame: str, seen: list[tuple[str, tuple[float, float, float], float]]) -> Any:
+    """seen: identity, position, translation_weight of each."""
+    made = [
+        words.LandmarkEntry(
+            identity, words.Pose(words.Point(x, y, z), words.Quaternion(0.0, 0.0, 0.0, 1.0)), weight, 0.0
+        )
+        for identity, (x, y, z), weight in seen
+    ]
+    return words.LandmarkList(words.Header(stamp(ns), frame), made)
+
+
+def tags(ns: int, frame: str, seen: list[tuple[list[int], tuple[float, float, float], float]]) -> Any:
+    """seen: the tag or the tags of a bundle, position, standard deviation of each."""
+    made = []
+    for numbers, (x, y, z), sigma in seen:
+        where = words.Pose(words.Point(x, y, z), words.Quaternion(0.0, 0.0, 0.0, 1.0))
+        covariance = diagonal(*[sigma**2] * 3, 0.0, 0.0, 0.0)
+        stamped = words.PoseWithCovarianceStamped(
+            words.Header(stamp(ns), frame), words.PoseWithCovariance(where, covariance)
+        )
+        made.append(words.AprilTagDetection(numbers, [0.16] * len(numbers), stamped))
+    return words.AprilTagDetectionArray(words.Header(stamp(ns), frame), made)
+
+
 def known_pose(ns: int, where: tuple[float, float, float], variances: list[float]) -> Any:
     return words.PoseWithCovarianceStamped(
         words.Header(stamp(ns), "map"), words.PoseWithCovariance(pose(*where), diagonal(*variances))

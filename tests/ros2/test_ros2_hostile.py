@@ -25,11 +25,13 @@ from factorbus.ros2.messages import (
     DETECTIONS,
     FIX,
     IMU,
+    LANDMARK_LIST,
     LINK,
     MAP_GRAPH,
     ODOMETRY,
     POSE,
     POSE_GRAPH,
+    TAGS,
     TRANSFORMS,
     Messages,
 )
@@ -43,6 +45,7 @@ LARGEST = sys.float_info.max
 TOPICS = {
     ODOMETRY: "/odom", POSE: "/initialpose", DETECTIONS: "/detections", FIX: "/fix", POSE_GRAPH: "/graph",
     MAP_GRAPH: "/mapGraph", LINK: "/link", TRANSFORMS: "/tf_static", IMU: "/imu",
+    LANDMARK_LIST: "/landmark", TAGS: "/tags",
 }  # fmt: skip
 WILD = (
     0.0, -0.0, 5e-324, -5e-324, 1e-160, 1e9, -1e9, 1.1e9, 1e12, 1e154, -1e154, 1e155, 1e300, 1e308, LARGEST, -LARGEST,
@@ -128,7 +131,8 @@ def message(type_name: str, ns: int, numbers: random.Random) -> Any:
             covariance[numbers.choice((*diagonal, numbers.randrange(size**2)))] = numbers.choice(WILD)
     if numbers.random() < 0.3:
         point = numbers.choice(points)
-        names = "xyz" if hasattr(point, "x") else ("latitude", "longitude", "altitude")
+        of_kinds = "xyz", ("latitude", "longitude", "altitude"), ("translation_weight", "rotation_weight")
+        (names,) = [names for names in of_kinds if hasattr(point, names[0])]
         setattr(point, numbers.choice(names), numbers.choice(WILD))
     if turns and numbers.random() < 0.2:
         setattr(numbers.choice(turns), numbers.choice("xyzw"), numbers.choice(WILD))
@@ -151,6 +155,13 @@ def plain(type_name: str, ns: int) -> tuple[Any, list[Any], list[Any], list[Any]
     if type_name == DETECTIONS:
         made = ros.detections(ns, "base_link", [(str(k), (1.0 + k, 2.0, 0.0), 0.1) for k in range(3)])
         results = [seen.results[0].pose for seen in made.detections]
+    elif type_name == TAGS:
+        made = ros.tags(ns, "base_link", [([k], (1.0 + k, 2.0, 0.0), 0.1) for k in range(3)])
+        results = [seen.pose.pose for seen in made.detections]
+    elif type_name == LANDMARK_LIST:
+        made = ros.landmark_list(ns, "base_link", [(str(k), (1.0 + k, 2.0, 0.0), 10.0) for k in range(3)])
+        poses = [seen.tracking_from_landmark_transform for seen in made.landmarks]
+        return made, [], [*(each.position for each in poses), *made.landmarks], [each.orientation for each in poses]
     elif type_name == ODOMETRY:
         made = ros.odometry(ns, at, [1e-4] * 6)
         results = [made.pose]

@@ -93,6 +93,15 @@ def test_its_options_and_numbers_are_those_of_the_command() -> None:
     assert (floors.least_m, floors.least_rad) == (0.001, 0.001)
     assert (floors.pose_m, floors.pose_rad, floors.landmark_m) == (0.01, 0.01, 0.01)
     assert (floors.closure_m, floors.closure_rad, floors.fix_m, defaults.fix_sigma_m) == (0.05, 0.02, 0.01, 5.0)
-    every = Settings(pose_graphs=("/a",), map_graphs=("/b",), links=("/c",), fixes=("/d",), imu="/e", space="space")
+    every = Settings(
+        landmark_lists=("/l",),
+        tags=("/t",),
+        pose_graphs=("/a",),
+        map_graphs=("/b",),
+        links=("/c",),
+        fixes=("/d",),
+        imu="/e",
+        space="space",
+    )
     named = {f"{package}/msg/{name}" for package, name in re.findall(r"`(\w+)/(\w+)`", README)}
     assert {*every.inputs().values(), TRANSFORMS} <= named

@@ -21,6 +21,7 @@ from factorbus.ros2.geometry import from_plane, from_quaternion
 from factorbus.ros2.messages import (
     DETECTIONS,
     FIX,
+    LANDMARK_LIST,
     LINK,
     MAP_GRAPH,
     MARKERS,
@@ -28,6 +29,7 @@ from factorbus.ros2.messages import (
     PATH,
     POSE,
     POSE_GRAPH,
+    TAGS,
     TRANSFORMS,
     Messages,
 )
@@ -41,6 +43,8 @@ TYPES = {
     ODOMETRY: words.Odometry,
     POSE: words.PoseWithCovarianceStamped,
     DETECTIONS: words.Detection3DArray,
+    LANDMARK_LIST: words.LandmarkList,
+    TAGS: words.AprilTagDetectionArray,
     PATH: words.Path,
     TRANSFORMS: words.TFMessage,
     MARKERS: words.MarkerArray,
@@ -209,6 +213,8 @@ def test_options_arrive() -> None:
         0.2,
     )
     np.testing.assert_array_equal(made.mounts["c"].t, from_quaternion((1, 2, 3), (0, 0, 0, 1)).t)
+    listed = bridge_settings(replace(options, landmark_lists=("/landmark",), tags=("/tags",), landmarks=()))
+    assert {"/detections": DETECTIONS, "/landmark": LANDMARK_LIST, "/tags": TAGS}.items() <= listed.inputs().items()
     assert (made.smooth_s, made.raw_transforms) == (3.0, "/r")
     assert (made.pose, made.imu, made.imu_noise.accelerometer_walk) == ("/c", "/i", 4.0)
     with pytest.raises(BadRosName, match="velocities, biases or gravity"):

@@ -1,7 +1,7 @@
 """ROS 2 messages by libraries that the bridge does not use: pycdr2 for CDR, zenoh-ros-type for definitions.
 
 What that does not define is written down here from the definitions of tf2_msgs, visualization_msgs, vision_msgs,
-pose_graph_tools_msgs and rtabmap_msgs.
+cartographer_ros_msgs, apriltag_ros, pose_graph_tools_msgs and rtabmap_msgs.
 The type hashes are computed here too, from REP 2016: the SHA-256 of a description in JSON.
 """
 
@@ -141,6 +141,33 @@ class Detection3DArray(IdlStruct, typename="Detection3DArray"):
 
 
 @dataclass
+class LandmarkEntry(IdlStruct, typename="LandmarkEntry"):
+    id: str
+    tracking_from_landmark_transform: Pose
+    translation_weight: float64
+    rotation_weight: float64
+
+
+@dataclass
+class LandmarkList(IdlStruct, typename="LandmarkList"):
+    header: Header
+    landmarks: sequence[LandmarkEntry]
+
+
+@dataclass
+class AprilTagDetection(IdlStruct, typename="AprilTagDetection"):
+    id: sequence[int32]
+    size: sequence[float64]
+    pose: PoseWithCovarianceStamped
+
+
+@dataclass
+class AprilTagDetectionArray(IdlStruct, typename="AprilTagDetectionArray"):
+    header: Header
+    detections: sequence[AprilTagDetection]
+
+
+@dataclass
 class PoseGraphNode(IdlStruct, typename="PoseGraphNode"):
     header: Header
     robot_id: int32
@@ -210,6 +237,8 @@ PACKAGES = {
     "nav_msgs": (Odometry, Path),
     "tf2_msgs": (TFMessage,),
     "sensor_msgs": (CompressedImage, Imu, NavSatFix, NavSatStatus),
+    "cartographer_ros_msgs": (LandmarkEntry, LandmarkList),
+    "apriltag_ros": (AprilTagDetection, AprilTagDetectionArray),
     "pose_graph_tools_msgs": (PoseGraphNode, PoseGraphEdge, PoseGraph),
     "rtabmap_msgs": (Link, MapGraph),
     "visualization_msgs": (Marker, MarkerArray, MeshFile, UVCoordinate),

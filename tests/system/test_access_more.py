@@ -199,5 +199,6 @@ def test_the_ready_configurations_are_what_the_command_makes(tmp_path: Path) -> 
         "boat1.json5": ("--client", "boat1"),
     }.items():
         made = tmp_path / name
-        subprocess.run([*command, str(made), *options], check=True, timeout=60)
+        ran = subprocess.run([*command, str(made), *options, "--json"], check=True, timeout=60, stdout=subprocess.PIPE)
+        assert json.loads(ran.stdout) == {"files": [str(made)]}
         assert made.read_text() == (folder / name).read_text(), f"make it anew: factorbus access ... --out {name}"

@@ -23,9 +23,9 @@ from factorbus.ros2.geometry import Transform, carried, local
 from factorbus.ros2.graphs import heard_graph
 from factorbus.ros2.inertial import InertialChain, Moment
 from factorbus.ros2.message_parts import Notes, stamp_ns_of, transform_of
-from factorbus.ros2.messages import DETECTIONS, FIX, IMU, ODOMETRY, POSE
+from factorbus.ros2.messages import FIX, IMU, ODOMETRY, POSE
 from factorbus.ros2.mounts import Mounts
-from factorbus.ros2.observations import LandmarkReader, cross_matrix
+from factorbus.ros2.observations import LANDMARK_TYPES, LandmarkReader, cross_matrix, observations_in
 from factorbus.ros2.odometry import OdometryReader
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
@@ -133,7 +133,7 @@ class FrontEnd:
             return self.odometry(message)
         if type_name == POSE:
             return self.pose(topic, message)
-        if type_name == DETECTIONS:
+        if type_name in LANDMARK_TYPES:
             return self.detections(topic, message)
         if type_name == IMU:
             return self.imu(topic, message)
@@ -193,8 +193,8 @@ class FrontEnd:
         return self._take(topic, message, self._use_pose)
 
     def detections(self, topic: str, message: Any) -> Draft | None:
-        """A vision_msgs/Detection3DArray.  Raises BadRosMessage."""
-        return self._take(topic, message, self._use_detections) if message.detections else None
+        """A message of one of LANDMARK_TYPES.  Raises BadRosMessage."""
+        return self._take(topic, message, self._use_detections) if len(observations_in(message)) else None
 
     def fix(self, topic: str, message: Any) -> Draft | None:
         """A sensor_msgs/NavSatFix.  Raises BadRosMessage."""

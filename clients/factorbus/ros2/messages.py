@@ -1,9 +1,10 @@
 """The ROS messages that are used: their type hashes, and CDR to objects and back, by rosbags.
 
-Landmarks come as vision_msgs/Detection3DArray: of the messages in common use it is the one that has for each
-observation an identity, a position in metres and a covariance (AprilTag's own message has corners in pixels; markers
-are for drawing).  Loop closures come as front ends publish their graphs: pose_graph_tools_msgs/PoseGraph (Kimera),
-rtabmap_msgs/MapGraph and Link.  These are in no type store, so their definitions stand here, as they are for ROS 2.
+Landmarks come as what has for each observation an identity and a position in metres: vision_msgs/Detection3DArray,
+which has a covariance too, cartographer_ros_msgs/LandmarkList, which has weights, and the AprilTagDetectionArray of
+apriltag_ros (that of apriltag_msgs has corners in pixels; markers are for drawing).  Loop closures come as front ends
+publish their graphs: pose_graph_tools_msgs/PoseGraph (Kimera), rtabmap_msgs/MapGraph and Link.  These are in no type
+store, so their definitions stand here, as they are for ROS 2.
 """
 
 import struct
@@ -20,6 +21,8 @@ from factorbus.wording import counted
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DETECTIONS = "vision_msgs/msg/Detection3DArray"
+LANDMARK_LIST = "cartographer_ros_msgs/msg/LandmarkList"
+TAGS = "apriltag_ros/msg/AprilTagDetectionArray"
 PATH = "nav_msgs/msg/Path"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FIX = "sensor_msgs/msg/NavSatFix"
@@ -59,6 +62,15 @@ _VISION = {
     ),
     DETECTIONS: "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
 }
+_LANDMARKS = {
+    "cartographer_ros_msgs/msg/LandmarkEntry": (
+        "string id\ngeometry_msgs/Pose tracking_from_landmark_transform\n"
+        "float64 translation_weight\nfloat64 rotation_weight"
+    ),
+    LANDMARK_LIST: "std_msgs/Header header\ncartographer_ros_msgs/LandmarkEntry[] landmarks",
+    "apriltag_ros/msg/AprilTagDetection": ("int32[] id\nfloat64[] size\ngeometry_msgs/PoseWithCovarianceStamped pose"),
+    TAGS: "std_msgs/Header header\napriltag_ros/AprilTagDetection[] detections",
+}
 _GRAPHS = {
     "pose_graph_tools_msgs/msg/PoseGraphNode": (
         "std_msgs/Header header\nint32 robot_id\nuint64 key\ngeometry_msgs/Pose pose"
@@ -94,7 +106,7 @@ class Stamp:
 
 def register_further_types(store: Any) -> None:
     """Add what landmarks and loop closures come as to a type store."""
-    for name, text in {**_VISION, **_GRAPHS}.items():
+    for name, text in {**_VISION, **_LANDMARKS, **_GRAPHS}.items():
         store.register(get_types_from_msg(text, name))
 
 

@@ -12,7 +12,7 @@ USUAL_IMU_NOISE = (1.6968e-4, 2.0e-3, 1.9393e-5, 3.0e-3)
 class RobotOptions:
     """The options of `factorbus ros2` and `factorbus replay` that are about a robot, under the command line's names.
 
-    odom, poses, landmarks: topics.  space: poses in space.  keyframe: metres, radians.
+    odom, poses, landmarks, landmark_lists, tags: topics.  space: poses in space.  keyframe: metres, radians.
     mounts: FRAME=x,y,z,qx,qy,qz,qw.  drift: per metre, per radian.
     imu: a topic.  imu_noise: as of `ImuNoise`; without, that of EuRoC's ADIS16448.
     pose_graphs, map_graphs, links, fixes: topics.  fix_sigma: metres.  robot_id: in pose graphs; None: the first.
@@ -28,6 +28,8 @@ class RobotOptions:
     keyframe: tuple[float, float]
     mounts: Sequence[str]
     drift: tuple[float, float]
+    landmark_lists: Sequence[str] = ()
+    tags: Sequence[str] = ()
     pose_graphs: Sequence[str] = ()
     map_graphs: Sequence[str] = ()
     links: Sequence[str] = ()

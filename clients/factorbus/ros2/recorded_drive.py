@@ -14,11 +14,13 @@ from factorbus.ros2.messages import (
     FIX,
     FORMER_NAMES,
     IMU,
+    LANDMARK_LIST,
     LINK,
     MAP_GRAPH,
     ODOMETRY,
     POSE,
     POSE_GRAPH,
+    TAGS,
     TRANSFORMS,
 )  # fmt: skip
 from factorbus.ros2.problems import BadRecording, BadRosMessage
@@ -27,6 +29,7 @@ from factorbus.ros2.settings import STATIC, Settings
 from factorbus.wording import counted
 
 _SHOWN = 8  # topics in a message
+_OPTIONS = {"landmark_lists": "landmark-list"}
 
 
 class RecordedSteps(list[Batch]):
@@ -164,16 +167,9 @@ def _with_topics(recording: RobotRecording, settings: Settings) -> tuple[Setting
     if not settings.odometry:
         settings, note = _with_odometry(recording, settings)
         notes.append(note)
-    if not settings.landmarks and (found := _of_type(recording, DETECTIONS)):
-        found, others = _of_this_robot(recording, settings, found)
-        settings = replace(settings, landmarks=tuple(topic.name for topic in found))
-        if found:
-            notes.append(f"landmarks: {_listed(found)}")
-        if others:
-            takes = " ".join(f"--landmarks {topic.name}" for topic in others)
-            notes.append(f"landmarks of another robot left out: {_listed(others)}; {takes} takes them")
-    settings, more = _with_graphs_and_fixes(recording, settings)
-    notes += more
+    for with_more in (_with_landmarks, _with_graphs_and_fixes):
+        settings, more = with_more(recording, settings)
+        notes += more
     if not settings.poses and (found := _of_type(recording, POSE)):
         takes = " ".join(f"--pose {topic.name}" for topic in found)
         notes.append(f"poses left out: {_listed(found)}; {takes} takes them, and --start pose begins with the first")
@@ -188,6 +184,22 @@ def _with_topics(recording: RobotRecording, settings: Settings) -> tuple[Setting
     if not settings.imu and (found := _of_type(recording, IMU)):
         takes = f"--space --imu {found[0].name} takes its raw samples"
         notes.append(f"IMU left out: {_listed(found)}; {takes}, where odometry was not made of them already")
+    return settings, notes
+
+
+def _with_landmarks(recording: RobotRecording, settings: Settings) -> tuple[Settings, list[str]]:
+    """With this robot's observations, of all types that are not named."""
+    notes = []
+    for name, type_name in (("landmarks", DETECTIONS), ("landmark_lists", LANDMARK_LIST), ("tags", TAGS)):
+        if getattr(settings, name) or not (found := _of_type(recording, type_name)):
+            continue
+        found, others = _of_this_robot(recording, settings, found)
+        settings = replace(settings, **{name: tuple(topic.name for topic in found)})
+        if found:
+            notes.append(f"landmarks: {_listed(found)}" + ("" if type_name == DETECTIONS else f" ({type_name})"))
+        if others:
+            takes = " ".join(f"--{_OPTIONS.get(name, name)} {topic.name}" for topic in others)
+            notes.append(f"landmarks of another robot left out: {_listed(others)}; {takes} takes them")
     return settings, notes
 
 

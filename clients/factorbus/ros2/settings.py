@@ -6,7 +6,18 @@ from dataclasses import dataclass, field, replace
 from factorbus.client.imu import ImuNoise
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.geometry import Transform, from_quaternion
-from factorbus.ros2.messages import DETECTIONS, FIX, IMU, LINK, MAP_GRAPH, ODOMETRY, POSE, POSE_GRAPH
+from factorbus.ros2.messages import (
+    DETECTIONS,
+    FIX,
+    IMU,
+    LANDMARK_LIST,
+    LINK,
+    MAP_GRAPH,
+    ODOMETRY,
+    POSE,
+    POSE_GRAPH,
+    TAGS,
+)  # fmt: skip
 from factorbus.ros2.options import USUAL_IMU_NOISE, BridgeOptions, RobotOptions
 from factorbus.ros2.problems import BadRosName
 
@@ -55,6 +66,8 @@ class Settings:
     odometry: str = "/odom"
     poses: tuple[str, ...] = USUAL_POSES
     landmarks: tuple[str, ...] = USUAL_LANDMARKS
+    landmark_lists: tuple[str, ...] = ()
+    tags: tuple[str, ...] = ()
     pose_graphs: tuple[str, ...] = ()
     map_graphs: tuple[str, ...] = ()
     links: tuple[str, ...] = ()
@@ -85,8 +98,9 @@ class Settings:
     def inputs(self) -> dict[str, str]:
         """Topics that are read, odometry first, with the type of each."""
         odometry = {self.odometry: ODOMETRY} if self.odometry else {}
-        groups = ((self.poses, POSE), (self.landmarks, DETECTIONS), (self.pose_graphs, POSE_GRAPH),
-                  (self.map_graphs, MAP_GRAPH), (self.links, LINK), (self.fixes, FIX))  # fmt: skip
+        groups = ((self.poses, POSE), (self.landmarks, DETECTIONS), (self.landmark_lists, LANDMARK_LIST),
+                  (self.tags, TAGS), (self.pose_graphs, POSE_GRAPH), (self.map_graphs, MAP_GRAPH), (self.links, LINK),
+                  (self.fixes, FIX))  # fmt: skip
         made = odometry | {name: type_name for names, type_name in groups for name in names}
         return made | ({self.imu: IMU} if self.imu else {})
 
@@ -131,6 +145,8 @@ def robot_settings(options: RobotOptions) -> Settings:
         odometry=options.odom,
         poses=tuple(options.poses),
         landmarks=tuple(options.landmarks),
+        landmark_lists=tuple(options.landmark_lists),
+        tags=tuple(options.tags),
         pose_graphs=tuple(options.pose_graphs),
         map_graphs=tuple(options.map_graphs),
         links=tuple(options.links),

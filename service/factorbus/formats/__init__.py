@@ -1,5 +1,5 @@
 """Graph files in and out: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL and TUM text, GLIM's maps and the poses of
-COLMAP's models are read, g2o, PyFactorGraph, JRL, TUM and KITTI are written.
+COLMAP's models and of nuScenes are read, g2o, PyFactorGraph, JRL, TUM and KITTI are written.
 
 `read` gives a `GraphFile`: the whole graph as one `Batch`, and its replay as one `Batch` a pose, in time order.
 """

@@ -71,7 +71,7 @@ class GraphFile:
 
     def _joined(self) -> tuple[Batch, tuple[I64, ...], tuple[I64, ...]]:
         """The graph, and lines and times of its factors, without what nothing is known of.  Raises FormatError."""
-        if self.dialect in ("tum", "colmap") and not self.batch.factors:
+        if self.dialect in ("tum", "colmap", "nuscenes") and not self.batch.factors:
             raise FormatError(self.path, None, "a trajectory, which has no measurements", "a graph, with its factors")
         if not self.batch.factors:
             if not self.poses:

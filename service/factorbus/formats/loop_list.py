@@ -34,7 +34,9 @@ def with_loops(graph: GraphFile, path: Path) -> GraphFile:
     group = graph.batch.variables[0] if len(graph.batch.variables) == 1 else None
     poses = None if group is None else group.values
     if graph.batch.factors or group is None or poses is None:
-        raise FormatError(graph.path, None, "a graph", "a trajectory (TUM, COLMAP), to which a list of loops is added")
+        raise FormatError(
+            graph.path, None, "a graph", "a trajectory (TUM, COLMAP, nuScenes), to which a list of loops is added"
+        )
     stamps = group.stamps
     if stamps is not None and (stamps != NO_STAMP).all():
         order = np.argsort(stamps, kind="stable")

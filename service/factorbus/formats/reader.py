@@ -24,6 +24,7 @@ from factorbus.formats.read_bal import BAL, is_bal, read_bal
 from factorbus.formats.read_colmap import COLMAP, is_colmap, read_colmap
 from factorbus.formats.read_glim import GLIM, is_glim, read_glim
 from factorbus.formats.read_jrl import is_jrl, read_jrl
+from factorbus.formats.read_nuscenes import NUSCENES, is_nuscenes, read_nuscenes
 from factorbus.formats.read_pyfg import is_pyfg, read_pyfg
 from factorbus.formats.read_tum import TUM, is_trajectory, read_trajectory
 from factorbus.formats.records import DIALECTS, FIX, G2O, SWITCH_PRIOR, Dialect, Vertex
@@ -35,7 +36,7 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol_parts
 from factorbus.wording import counted
 
-READS = (*DIALECTS, PYFG, JRL, TUM, BAL, GLIM, COLMAP)
+READS = (*DIALECTS, PYFG, JRL, TUM, BAL, GLIM, COLMAP, NUSCENES)
 _NAMED = (PYFG, JRL, GLIM)  # forms whose keys are symbols, and not ids
 
 # A prior of a point that names a pose is one of its position: RTAB-Map writes them so.
@@ -48,11 +49,11 @@ def read(
     path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False, whole: bool = False
 ) -> GraphFile:
     """The graph in `path`: g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, BAL or TUM text, plain or gzipped, or the
-    folder of a map that GLIM has saved, or of a COLMAP model.
+    folder of a map that GLIM has saved, or of a COLMAP model, or nuScenes's ego_pose.json.
 
     dialect: one of READS; without it the names of the records decide, and the ending where they do not; a guess is in
-    the notes.  TUM and COLMAP are trajectories: poses with time stamps, and no factors.  BAL is cameras, their lenses
-    and points, all in one step (`read_bal`).  GLIM: `read_glim`.
+    the notes.  TUM, COLMAP and nuScenes are trajectories: poses with time stamps, and no factors.  BAL is cameras,
+    their lenses and points, all in one step (`read_bal`).  GLIM: `read_glim`.
     Keys are symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols
     and time stamps are, all keys are the ids themselves; of pyfg they are its names, A12 is symbol("A", 12).  JRL
     is JSON: its keys are symbols, what it says beside the graph is `log`, and errors name the place in place of a line.
@@ -76,6 +77,8 @@ def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFi
         left = LeftOut(file, strict, whole)
         batch, turns, log = read_jrl(file, content, left)
         return replace(_graph(file, JRL, batch, turns, left, "keys"), log=log)
+    if dialect == NUSCENES or (dialect is None and is_nuscenes(content)):
+        return read_nuscenes(file, content)
     if dialect == BAL or (dialect is None and is_bal(content)):
         return read_bal(file, content)
     buckets = buckets_of(file, content)

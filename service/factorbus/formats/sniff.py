@@ -25,7 +25,7 @@ class Guess:
 def dialect_named(file: str, name: str) -> Guess:
     """The dialect that somebody named.  Raises FormatError when there is none of that name."""
     if name not in DIALECTS:
-        there = ", ".join((*DIALECTS, "pyfg", "jrl", "tum", "bal", "glim", "colmap"))
+        there = ", ".join((*DIALECTS, "pyfg", "jrl", "tum", "bal", "glim", "colmap", "nuscenes"))
         raise FormatError(file, None, f"dialect {name!r}", f"one of {there}")
     return Guess(DIALECTS[name])
 

@@ -7,8 +7,9 @@ from typing import Any
 
 import click
 
+from factorbus.cli.output.console import document
 from factorbus.cli.output.exits import USAGE, Stopped, input_file, output_file
-from factorbus.cli.process.options import file_argument, out_option
+from factorbus.cli.process.options import file_argument, json_option, out_option
 
 
 @click.command()
@@ -20,14 +21,16 @@ from factorbus.cli.process.options import file_argument, out_option
 @click.option("--users", default="", metavar="FILE", help="Know clients by password; lines NAME:PASSWORD.")
 @click.option("--client", default="", metavar="NAME", help="Write the configuration of client NAME instead.")
 @out_option("--out", "out", "Write it here instead of to standard output.", "FILE.json5")
-def command(file: Path, certificates: str, name: str, users: str, client: str, out: Path | None) -> None:
+@json_option
+def command(file: Path, certificates: str, name: str, users: str, client: str, out: Path | None, as_json: bool) -> None:
     """Write the Zenoh configuration that lets everybody in FILE.toml do their part, and nobody else anything.
 
     The file has a table for each role: front_end, viewer, worker, operator, replica, and at a router also service and
     router.
 
     A name is the common name of a certificate (deploy/zenoh/certificates.sh), or with --users a user with a password.
-    Give the result to `factorbus serve --zenoh`, or to the Zenoh router that everybody connects to.
+    Give the result to `factorbus serve --zenoh`, or to the Zenoh router that everybody connects to. It is JSON already:
+    with --json and --out the document says which file was written.
 
     \b
       [front_end]                       # inserts under its own name
@@ -59,6 +62,8 @@ def command(file: Path, certificates: str, name: str, users: str, client: str, o
             "access_control": access_control(grants, "usernames" if users else "cert_common_names"),
         }
     _write(json.dumps(configuration, indent=2) + "\n", out, secret=bool(client and users))
+    if as_json and out is not None:
+        document({"files": [str(out)]})
 
 
 def _server(certificates: str, name: str, users: str) -> dict[str, Any]:

@@ -59,8 +59,8 @@ def command(
     source: Path, target: Path, dialect: str | None, strict: bool, options: ConvertOptions, as_json: bool
 ) -> None:
     """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg, JRL .jrl or .jrl.cbor, BAL or TUM text, the
-    folder of a map that GLIM has saved, or of a COLMAP model) and write TARGET (.g2o, .pyfg, .jrl, .jrl.cbor, .tum or
-    .kitti, by its ending).
+    folder of a map that GLIM has saved, or of a COLMAP model, nuScenes's ego_pose.json) and write TARGET (.g2o, .pyfg,
+    .jrl, .jrl.cbor, .tum or .kitti, by its ending).
 
     What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
     letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum. A .tum has each pose's time stamp.

@@ -162,8 +162,9 @@ def check_command(context: click.Context, names: tuple[str, ...], as_json: bool)
 
 @command.command("path")
 @click.argument("name")
+@json_option
 @click.pass_context
-def path_command(context: click.Context, name: str) -> None:
+def path_command(context: click.Context, name: str, as_json: bool) -> None:
     """Print the path of data set NAME.
 
     What only the gtsam wheel has is converted into the cache first.
@@ -176,7 +177,10 @@ def path_command(context: click.Context, name: str) -> None:
         dataset = dataset_named(name, _catalogue(context))
     if path is None:
         raise Stopped("not_found", f"{dataset.name} is not on this machine: factorbus datasets fetch {dataset.name}")
-    click.echo(str(path))
+    if as_json:
+        screen.document({"name": dataset.name, "path": str(path)})
+    else:
+        click.echo(str(path))
 
 
 def _catalogue(context: click.Context) -> Sequence[Dataset]:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import click
 
+from factorbus.cli.output.console import document
 from factorbus.cli.output.exits import USAGE, Stopped
+from factorbus.cli.process.options import json_option
 
 _PAGES = Path(__file__).parents[1] / "codes.md"
 # Exceptions whose code is not their name in another spelling.
@@ -18,7 +20,7 @@ _CODES = {
     "no_mirror": "unavailable", "not_finite_numbers": "not_finite",
     "not_held": "unknown_variable", "not_recorded": "no_journal", "not_reached": "unavailable",
     "dataset_problem": "problem", "format_error": "bad_file",
-    "bad_recording": "bad_file",
+    "bad_parameters": "bad_file", "bad_recording": "bad_file",
     "map_there": "map_exists", "no_pose": "unknown_variable", "nobody_listens": "unavailable",
     "not_here": "unknown_map", "missing_variables": "unknown_variable",
     "not_in_map": "unknown_variable", "solver_error": "problem",
@@ -28,7 +30,8 @@ _CODES = {
 
 @click.command()
 @click.argument("code", required=False)
-def command(code: str | None) -> None:
+@json_option
+def command(code: str | None, as_json: bool) -> None:
     """Say what the error CODE means and what to do about it; without CODE, list all of them.
 
     The code of an error is what stands in brackets behind it. The name of an exception, such as NotConverged, does too.
@@ -39,6 +42,9 @@ def command(code: str | None) -> None:
     factorbus explain
     """
     pages = read_pages()
+    if code is None and as_json:
+        document({"codes": {name: _summary(text) for name, text in pages.items()}})
+        return
     if code is None:
         width = shutil.get_terminal_size((120, 24)).columns
         for name, text in pages.items():
@@ -51,6 +57,9 @@ def command(code: str | None) -> None:
         hint = f"did you mean {' or '.join(near)}?" if near else "factorbus explain lists all of them"
         wanted = "a code that factorbus explain lists"
         raise Stopped("unknown_code", f"there is no error code {name!r}; {hint}", USAGE, seen=name, wanted=wanted)
+    if as_json:
+        document({"code": name, "text": pages[name]})
+        return
     click.echo(f"{name}\n\n{pages[name]}")
 
 

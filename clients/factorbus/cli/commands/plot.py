@@ -1,14 +1,15 @@
 """`factorbus plot`: pictures of maps, drives and systems, from files and from the bus."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
 from factorbus.cli.output.exits import output_file, require
-from factorbus.cli.process.options import ellipses_option, mode_option, out_option, zenoh_option
+from factorbus.cli.process.options import ellipses_option, json_option, mode_option, out_option, zenoh_option
 from factorbus.cli.process.reading import reading_options
 from factorbus.wording import counted
 
@@ -39,8 +40,34 @@ def _source(command: F) -> F:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """The file that was asked for, if one was, and how it is said where the picture is."""
+
+    path: Path | None
+    as_json: bool
+
+    def say(self, path: Path) -> None:
+        from factorbus.cli.output.console import document
+
+        if self.as_json:
+            document({"files": [str(path)]})
+        else:
+            click.echo(path)
+
+
 def _out(what: str) -> Callable[[F], F]:
-    return out_option("--out", "out", f"The picture.  [default: SOURCE-{what}.png here]", "FILE.png")
+    """--out and --json, as the argument `out`."""
+    option = out_option("--out", "path", f"The picture.  [default: SOURCE-{what}.png here]", "FILE.png")
+
+    def with_options(command: F) -> F:
+        @wraps(command)
+        def run(path: Path | None, as_json: bool, **options: Any) -> Any:
+            return command(out=_Picture(path, as_json), **options)
+
+        return option(json_option(run))  # type: ignore[return-value]
+
+    return with_options
 
 
 @command.command("map")
@@ -56,7 +83,7 @@ def map_command(
     strict: bool,
     solve: bool,
     ellipses: int,
-    out: Path | None,
+    out: _Picture,
 ) -> None:
     """Trajectory, landmarks, loop closures, where odometry alone would have led, and the ground truth of a .jrl, moved
     as one rigid body to where it fits the trajectory best.
@@ -74,14 +101,14 @@ def map_command(
 
     drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict))
     drawn = solved(drawn, on_file=connect is None) if solve else with_values(drawn)
-    path = drawn.file("map", out)
+    path = drawn.file("map", out.path)
     estimate = of_the_map(drawn.graph)  # what is on a robot, or another frame, is drawn nowhere
     placed = replace(drawn, graph=drawn.graph._replace(variables=estimate))
     spread = spread_in(placed, connect, ellipses, zenoh) if ellipses else None
     truth = aligned_truth(drawn.truth, estimate)
     with output_file(path):
         draw(path, [drawn.unsolved()], estimate, DriveHistory(), drawn.name, drawn.about, truth, spread)
-    click.echo(path)
+    out.say(path)
 
 
 @command.command("drive")
@@ -95,9 +122,7 @@ def map_command(
     help="Solve from scratch at every Nth step, to hold χ² against.  [default: ten times]",
 )
 @_out("drive")
-def drive_command(
-    source: str, dialect: str | None, strict: bool, mode: str, every: int | None, out: Path | None
-) -> None:
+def drive_command(source: str, dialect: str | None, strict: bool, mode: str, every: int | None, out: _Picture) -> None:
     """Drive SOURCE through a map in this process: χ² beside the batch optimum, and the time of each step.
 
     \b
@@ -120,19 +145,20 @@ def drive_command(
         driven = insert_steps(target, file.steps(), max(file.poses // 10, 1) if every is None else every, show)
     reports = [step.report for step in driven.steps]
     name = Path(file.path).stem
-    path = out or Path(f"{name}-drive.png")
+    path = out.path or Path(f"{name}-drive.png")
     about = f"{counted(driven.poses, 'pose')}, {counted(driven.factors, 'factor')}, mode {reports[-1]['mode']}"
     figure = drive_figure(
         history_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
     )
     _save(figure, path, name)
+    out.say(path)
 
 
 @command.command("sparsity")
 @_source
 @_out("sparsity")
 def sparsity_command(
-    source: str, connect: str | None, zenoh: str, dialect: str | None, strict: bool, out: Path | None
+    source: str, connect: str | None, zenoh: str, dialect: str | None, strict: bool, out: _Picture
 ) -> None:
     """Λ in the order of keys, Λ in the order of elimination, and the fill-in of its factor R.
 
@@ -146,15 +172,16 @@ def sparsity_command(
     from factorbus.cli.output.sparsity import pattern_of
     from factorbus.viz import sparsity_figure
 
-    path = drawn.file("sparsity", out)
+    path = drawn.file("sparsity", out.path)
     _save(sparsity_figure(pattern_of(drawn.graph), drawn.name), path, drawn.name)
+    out.say(path)
 
 
 @command.command("tree")
 @_source
 @_out("tree")
 def tree_command(
-    source: str, connect: str | None, zenoh: str, dialect: str | None, strict: bool, out: Path | None
+    source: str, connect: str | None, zenoh: str, dialect: str | None, strict: bool, out: _Picture
 ) -> None:
     """The elimination tree of Λ, and what of it the last loop closure makes anew.
 
@@ -168,9 +195,10 @@ def tree_command(
     from factorbus.cli.output.sparsity import last_loop, pattern_of
     from factorbus.viz import tree_figure
 
-    path = drawn.file("tree", out)
+    path = drawn.file("tree", out.path)
     pattern = pattern_of(drawn.graph)
     _save(tree_figure(pattern, last_loop(drawn.graph, pattern), drawn.name), path, drawn.name)
+    out.say(path)
 
 
 def _ready(load: Callable[[], Any]) -> Any:
@@ -180,9 +208,8 @@ def _ready(load: Callable[[], Any]) -> Any:
 
 
 def _save(figure: Any, path: Path, name: str) -> None:
-    """The picture in its file, whose name is printed."""
+    """The picture in its file."""
     from factorbus.viz import save
 
     with output_file(path):
         save(figure, path, name)
-    click.echo(path)

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import click
 
-from factorbus.cli.output.console import print_note
+from factorbus.cli.output.console import document, print_note
 from factorbus.cli.output.exits import Stopped, require
+from factorbus.cli.process.options import json_option
 
 
 @click.command()
-def command() -> None:
+@json_option
+def command(as_json: bool) -> None:
     """Compile the kernels of solver, service and workers into the cache, and say how long it took.
 
     Do it once after installing or upgrading, on each machine that runs `factorbus serve` or `factorbus work`.
@@ -24,7 +26,16 @@ def command() -> None:
     _check_cache()
     from factorbus.service.operations.warm import seconds_compiling, warm_service
 
-    seconds = warm_service(lambda kernel: print_note(f"  compiling {kernel}"))
+    compiled: list[str] = []
+
+    def show(kernel: str) -> None:
+        compiled.append(kernel)
+        print_note(f"  compiling {kernel}")
+
+    seconds = warm_service(show)
+    if as_json:
+        document({"seconds": seconds, "compiling_seconds": seconds_compiling(), "compiled": compiled})
+        return
     click.echo(f"kernels ready in {seconds:.1f} s, {seconds_compiling():.1f} s of it compiling")
 
 

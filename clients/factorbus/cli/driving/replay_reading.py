@@ -15,7 +15,7 @@ from factorbus.ros2.options import RobotOptions
 # What is given one by one, and collected under the name of several.
 _ONCE = {
     "poses": "pose", "mounts": "mount", "pose_graphs": "pose_graph", "map_graphs": "map_graph", "links": "link",
-    "fixes": "fix",
+    "fixes": "fix", "landmark_lists": "landmark_list",
 }  # fmt: skip
 
 

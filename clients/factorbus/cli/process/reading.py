@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 # The graph formats that are read; `tests/clients/test_cli_files.py` holds them to the reader's own list.
-DIALECTS = ("g2o", "toro", "isam", "slam++", "pyfg", "jrl", "tum", "bal", "glim", "colmap")
+DIALECTS = ("g2o", "toro", "isam", "slam++", "pyfg", "jrl", "tum", "bal", "glim", "colmap", "nuscenes")
 COUNTED = (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))  # of a graph, and of one of them
 IDS = ("auto", "ids", "keys", "counted")
 GRAPHS = (".g2o", ".pyfg", ".jrl", ".cbor")  # endings of files with the whole graph; others are trajectories

@@ -34,6 +34,14 @@ def robot_options(usual: bool) -> Callable[[F], F]:
                 help=f"vision_msgs/Detection3DArray, to read.  [default: {landmarks}]",
             ),
             click.option(
+                "--landmark-list", "landmark_lists", multiple=True, metavar="TOPIC",
+                help=f"cartographer_ros_msgs/LandmarkList, likewise.  [default: {graphs}]",
+            ),
+            click.option(
+                "--tags", multiple=True, metavar="TOPIC",
+                help=f"AprilTagDetectionArray of apriltag_ros, likewise.  [default: {graphs}]",
+            ),
+            click.option(
                 "--pose-graph", "pose_graphs", multiple=True, metavar="TOPIC",
                 help=f"pose_graph_tools_msgs/PoseGraph, whose loop closures to read.  [default: {graphs}]",
             ),
