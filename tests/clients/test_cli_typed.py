@@ -51,6 +51,8 @@ def test_pictures_are_those_that_can_be_drawn() -> None:
         (["ask", "why", "m", "3", "--variable", "--factor", *NOWHERE], "--variable and --factor exclude each other"),
         (["ask", "repair", "m", "--loss", "dcs", *NOWHERE], "--loss says what --apply does"),
         (["ask", "why", "m", "-1", *NOWHERE], "A number below 0 is written behind `--`"),
+        (["replay", "any.mcap", "--map-topics"], "Topics are named by their types: --odom,"),
+        (["ros2", "m", "--topic=/odom"], "Topics are named by their types: --odom,"),
         (["change", "weigh", "m", "-1", "3", *NOWHERE], "A number below 0 is written behind `--`"),
         (["change", "loss", "m", "foo", "1", "3", *NOWHERE], "changes: the loss 'foo'; wanted none, or one of huber"),
         (["change", "loss", "m", "dcs", "0", "3", *NOWHERE], "changes: the scale 0.0; wanted finite numbers above 0"),

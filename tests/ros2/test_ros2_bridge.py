@@ -278,3 +278,20 @@ def test_a_front_end_with_closures_and_gnss_makes_the_map_of_the_same_graph(
     log = joined.errors()
     for text in ("the origin of GNSS is", "GNSS's frame f0 by", "its edges of odometry are left out"):
         assert log.count(text) == 1, text
+
+
+def test_landmark_lists_and_tags_are_heard_by_their_types(
+    endpoint: str, spawn: Callable[..., Process], node: Any
+) -> None:
+    joined = bridge(spawn, endpoint, "listed", 9, "--landmark-list", "/landmark", "--tags", "/tags")
+    node.wait_for_endpoints(10)
+    node.publish("/odom", ros.odometry(SECOND, (0.0, 0.0, 0.0)))
+    node.publish("/landmark", ros.landmark_list(SECOND, "base_link", [("7", (2.0, 1.0, 0.0), 20.0)]))
+    node.publish("/tags", ros.tags(SECOND, "base_link", [([8], (3.0, -1.0, 0.0), 0.05)]))
+    with connect(endpoint, client="looker", timeout_s=60) as bus, bus.map("listed") as looked:
+        looked.estimate.wait_for(3)
+        keys, places = looked.estimate.columns("point2")
+        assert [key & 0xFF for key in keys.tolist()] == [7, 8]
+        np.testing.assert_allclose(places, [[2.0, 1.0], [3.0, -1.0]], atol=1e-6)
+    joined.signal(signal.SIGTERM)
+    assert joined.wait() == 0

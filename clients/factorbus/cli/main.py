@@ -111,8 +111,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         error.show()
         if as_json:
             document({"problem": {"code": "bad_usage", "message": error.format_message(), "detail": {}}})
-        if isinstance(error, click.NoSuchOption) and re.fullmatch(r"-[0-9.]", error.option_name):
-            click.echo("A number below 0 is written behind `--`, and options before that: NAME -- -1", err=True)
+        if isinstance(error, click.NoSuchOption) and (hint := _hint(error)):
+            click.echo(hint, err=True)
         return USAGE
     except (KeyboardInterrupt, click.Abort):
         click.echo("interrupted", err=True)
@@ -130,6 +130,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return report(Stopped("cannot_write", f"standard output cannot be written: {error.strerror}"), False, debug)
     except Exception as error:
         return report(error, as_json=as_json, debug=debug)
+
+
+def _hint(error: click.NoSuchOption) -> str:
+    """What was meant, where more is to be said than the names of near options."""
+    if re.fullmatch(r"-[0-9.]", error.option_name):
+        return "A number below 0 is written behind `--`, and options before that: NAME -- -1"
+    if "topic" in error.option_name and error.ctx and error.ctx.info_name in ("replay", "ros2"):
+        return (
+            "Topics are named by their types: --odom, --landmarks, --pose-graph, --fix and others; "
+            "`factorbus replay` finds what is not named, and says which topics it took"
+        )
+    return ""
 
 
 def _print_what_can_be() -> None:
