@@ -170,6 +170,35 @@ def test_a_part_that_a_weak_prior_holds_ends_where_a_merge_of_two_maps_does(endp
         np.testing.assert_allclose(value, merged[key], atol=1e-5)
 
 
+def test_what_marginalize_left_of_a_prior_goes_as_a_prior_does(endpoint: str) -> None:
+    """And what it left of relative poses alone turns with the part: the estimate is that of a merge."""
+    one, other, candidates = drives("se2", 9, 8, 6)
+    tidy = Changes().free("y0"), Changes().marginalize("y0"), Changes().marginalize("y30", "y31")
+    with connect(endpoint, client="matcher", timeout_s=60) as bus:
+        with bus.map("hall-l") as hall, bus.map("yard-l") as yard:
+            for into in (hall, yard):
+                fill(into, other, "y")
+                into.insert(Draft().prior_se2("y0", (0, 0, 0), sigmas=(1, 1, 1)))
+                for changes in tidy:
+                    into.change(changes)
+            fill(hall, one)
+            kept = [each for each in candidates if each.b not in (0, 30, 31)]
+            joined = attach(hall, "y", drafted("se2", kept), absolute="leave_out", settle=True)
+            assert joined.left_out
+            assert all(name.startswith("linear") for name in joined.left_out)
+            hall.settle()
+            attached, chi2 = values_of(hall), hall.chi2().chi2
+        with bus.map("hall-k") as hall, bus.map("yard-l") as yard:
+            fill(hall, one)
+            hall.merge(yard, anchors=joined.alignment.anchors(), absolute="leave_out", settle=True)
+            hall.settle()
+            merged = values_of(hall)
+            assert chi2 == pytest.approx(hall.chi2().chi2, rel=1e-6)
+    assert attached.keys() == merged.keys()
+    for key, value in attached.items():
+        np.testing.assert_allclose(value, merged[key], atol=1e-3)
+
+
 def between_parts(hall: Map) -> int:
     """How many factors join two letters."""
     return sum(int((np.ptp(g.keys >> 56, axis=1) > 0).sum()) for g in hall.graph().batch.factors)

@@ -203,10 +203,13 @@ def _changes(
     """What brings the part to where it lies, and factors of it that have other numbers there."""
     gone, turned = list[I64](), list[Factors]()
     for group, which in alone:
+        gone.append(_ids(group)[which])
+        if which.all():
+            continue
         stay = pick_factors(group, ~which)
         there = transform_factors(stay, T, roles)
         others = _differ(stay, there)
-        gone += [_ids(group)[which], _ids(stay)[others]]
+        gone.append(_ids(stay)[others])
         if others.any():
             turned.append(pick_factors(there, others)._replace(ids=None))
     if not sum(map(len, gone)):
