@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,10 +127,12 @@ def test_what_knows_more_of_its_frame_is_refused_unless_that_may_go(endpoint: st
             .landmark_se2("y7", "m1", (2, 0.1), sigmas=(0.1, 0.1))
         )
         revision = hall.estimate.revision
-        with pytest.raises(AbsoluteFactors, match="1 fixed, 1 position_se2"):
+        with pytest.raises(AbsoluteFactors, match=r"1 fixed, 1 position_se2.*absolute=.leave_out. attaches") as refused:
             attach(hall, "ym", drafted("se2", candidates))
+        assert "keep" not in str(refused.value), "which attach has not"
         for letters, said in (
-            ("z", "no variable with these letters; its letters are m, x, y"),
+            ("z", "no variable with letter z; .* of those there are: m, x, y"),
+            ("mz", "no variable with letter z"),
             ("mxy", "with other letters"),
             ("", "letters is empty"),
         ):
@@ -165,6 +168,109 @@ def test_a_part_that_a_weak_prior_holds_ends_where_a_merge_of_two_maps_does(endp
     assert attached.keys() == merged.keys()
     for key, value in attached.items():
         np.testing.assert_allclose(value, merged[key], atol=1e-5)
+
+
+def test_what_marginalize_left_of_a_prior_goes_as_a_prior_does(endpoint: str) -> None:
+    """And what it left of relative poses alone turns with the part: the estimate is that of a merge."""
+    one, other, candidates = drives("se2", 9, 8, 6)
+    tidy = Changes().free("y0"), Changes().marginalize("y0"), Changes().marginalize("y30", "y31")
+    with connect(endpoint, client="matcher", timeout_s=60) as bus:
+        with bus.map("hall-l") as hall, bus.map("yard-l") as yard:
+            for into in (hall, yard):
+                fill(into, other, "y")
+                into.insert(Draft().prior_se2("y0", (0, 0, 0), sigmas=(1, 1, 1)))
+                for changes in tidy:
+                    into.change(changes)
+            fill(hall, one)
+            kept = [each for each in candidates if each.b not in (0, 30, 31)]
+            joined = attach(hall, "y", drafted("se2", kept), absolute="leave_out", settle=True)
+            assert joined.left_out
+            assert all(name.startswith("linear") for name in joined.left_out)
+            hall.settle()
+            attached, chi2 = values_of(hall), hall.chi2().chi2
+        with bus.map("hall-k") as hall, bus.map("yard-l") as yard:
+            fill(hall, one)
+            hall.merge(yard, anchors=joined.alignment.anchors(), absolute="leave_out", settle=True)
+            hall.settle()
+            merged = values_of(hall)
+            assert chi2 == pytest.approx(hall.chi2().chi2, rel=1e-6)
+    assert attached.keys() == merged.keys()
+    for key, value in attached.items():
+        np.testing.assert_allclose(value, merged[key], atol=1e-3)
+
+
+def between_parts(hall: Map) -> int:
+    """How many factors join two letters."""
+    return sum(int((np.ptp(g.keys >> 56, axis=1) > 0).sum()) for g in hall.graph().batch.factors)
+
+
+def test_of_two_that_attach_one_part_at_once_the_second_is_refused(endpoint: str) -> None:
+    """Else the candidates would be in the map twice, and count twice."""
+    one, other, candidates = drives("se2", 5, 10, 8)
+    with connect(endpoint, client="matcher", timeout_s=60) as bus, bus.map("hall-t") as hall:
+        fill(hall, one)
+        fill(hall, other, "y")
+        insert, before = hall.insert, hall.stats()["factors"]
+        with connect(endpoint, client="again", timeout_s=60) as others, others.map("hall-t") as same:
+
+            def insert_behind(*arguments: Any, **options: Any) -> Any:
+                hall.insert = insert  # type: ignore[method-assign]
+                assert attach(same, "y", drafted("se2", candidates)).accepted
+                return insert(*arguments, **options)
+
+            hall.insert = insert_behind  # type: ignore[method-assign]
+            with pytest.raises(CannotMerge, match="joined to the rest already"):
+                attach(hall, "y", drafted("se2", candidates))
+        assert between_parts(hall) == hall.stats()["factors"] - before == 10
+
+
+def test_what_of_a_part_hangs_on_no_candidate_is_named(endpoint: str) -> None:
+    """Nobody measured where it is: it is not carried along."""
+    one, other, candidates = drives("se2", 5, 10, 4)
+    with connect(endpoint, client="matcher", timeout_s=60) as bus, bus.map("hall-c") as hall:
+        fill(hall, one)
+        fill(hall, other, "y")
+        hall.insert(Draft().se2("z0").prior_se2("z0", (0, 0, 0), sigmas=SIGMAS))
+        hall.insert(Draft().se2("z1").between_se2("z0", "z1", (1, 0, 0), sigmas=SIGMAS))
+        revision = hall.estimate.revision
+        with pytest.raises(CannotMerge, match="no factor joins z0, z1 to a pose of a candidate that agrees"):
+            attach(hall, "yz", drafted("se2", candidates), absolute="leave_out")
+        assert hall.estimate.revision == revision
+        assert attach(hall, "y", drafted("se2", candidates)).accepted
+        np.testing.assert_array_equal(hall.estimate["z0"], (0, 0, 0))
+
+
+def test_a_candidate_that_is_none_is_named(endpoint: str) -> None:
+    one, other, _ = drives("se2", 5, 10, 4)
+    with connect(endpoint, client="matcher", timeout_s=60) as bus, bus.map("hall-n") as hall:
+        fill(hall, one)
+        fill(hall, other, "y")
+        hall.insert(Draft().se2(7).prior_se2(7, (0, 0, 0), sigmas=SIGMAS))
+        for a, b, said in (
+            ("x900", "y1", r"candidates name x900, no se2 in the map's frame.*`Map\.estimate`"),
+            ("y2", "y1", r"two poses of one side: \(y2, y1\)"),
+            ("x2", "x1", r"two poses of one side: \(x2, x1\)"),
+        ):
+            with pytest.raises(CannotMerge, match=said):
+                attach(hall, "y", Draft().between_se2(a, b, (0, 0, 0), sigmas=SIGMAS))
+        with pytest.raises(CannotMerge, match=r"there are: none \(keys that are a number\), x, y"):
+            attach(hall, "q", Draft().between_se2("x1", "y1", (0, 0, 0), sigmas=SIGMAS))
+
+
+def test_candidates_that_the_map_tests_already_are_not_counted_twice(endpoint: str) -> None:
+    one, other, candidates = drives("se2", 5, 10, 8)
+    with connect(endpoint, client="matcher", timeout_s=60) as bus:
+        bus.create("hall-d", closures="test")
+        with bus.map("hall-d") as hall:
+            fill(hall, one)
+            fill(hall, other, "y")
+            hall.insert(drafted("se2", candidates[:6]))
+            suspects = hall.suspects()
+            with pytest.raises(CannotMerge, match=r"tests candidates that agree already.*remove_factors\(\["):
+                attach(hall, "y", drafted("se2", candidates))
+            hall.change(Changes().remove_factors(suspects.factors))
+            assert attach(hall, "y", drafted("se2", candidates)).accepted
+            assert between_parts(hall) == 10
 
 
 def values_of(hall: Map) -> dict[int, np.ndarray]:

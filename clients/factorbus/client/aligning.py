@@ -87,10 +87,10 @@ class Alignment:
         """The candidates that agree, for `Map.merge`.  Raises NotAligned, AmbiguousAlignment."""
         if self.verdict == AMBIGUOUS:
             raise AmbiguousAlignment(
-                f"{self.said}; nothing was merged. Give candidates at more places, or those of one set alone as anchors"
+                f"{self.said}; nothing has changed. Give candidates at more places, or of one set alone as anchors"
             )
         if self.verdict != ALIGNED:
-            raise NotAligned(f"{self.said}; nothing was merged. Give more candidates, at places far from each other")
+            raise NotAligned(f"{self.said}; nothing has changed. Give more candidates, at places far from each other")
         return Batch((), tuple(pick_factors(g, np.isin(rows, self.agree)) for g, rows in _numbered(self.candidates)))
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from factorbus.client.aligning import ALIGNED, Alignment, align_sides, kind_of_candidates, side_of
-from factorbus.client.arguments import of_type
+from factorbus.client.arguments import checked_flag, of_type
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.map import Map
@@ -29,16 +29,21 @@ from factorbus.client.merging import (
     hold_in_any_frame,
     is_gauge,
 )
+from factorbus.client.parts import adrift, keys_named, pairs_named, split_by_letters
 from factorbus.client.roles import Roles, roles_of, split_mounts
 from factorbus.client.transform_factors import transform_factors
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import VARIABLE_KINDS, name_of_kind
 from factorbus.proto.messages import Accepted, Batch, Factors, Variables
-from factorbus.proto.roles import mounts_of, pick_factors, pick_variables
-from factorbus.proto.symbols import format_symbol, symbol
+from factorbus.proto.problems import Refused
+from factorbus.proto.roles import pick_factors, pick_variables
 
 _ABSOLUTE = ("refuse", "leave_out")
-_SHOWN = 3
+_TRIES = 3
+_WORDS = (
+    "the part says where it is in its own frame more than once ({}), which is wrong in that of the rest; "
+    'nothing was attached. absolute="leave_out" attaches it without them'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,79 +76,105 @@ def attach(
     none of them may be in the map before.  absolute: what the part knows of its own frame beyond one fixed pose or one
     prior of a pose, which go: "refuse" if there is more (AbsoluteFactors), or "leave_out" all of it.
 
-    The part is to be a part: a factor between it and the rest is refused (CannotMerge).  Mounts, and numbers such as a
-    bias or a scale, may be shared.  What robots insert meanwhile goes along with what it hangs on.
+    The part is to be a part: a factor between it and the rest is refused (CannotMerge), and so is a part of which
+    something hangs on no candidate that agrees.  Mounts, and numbers such as a bias or a scale, may be shared.  What
+    robots insert meanwhile goes along with what it hangs on.  Of two that attach a part at once the second is refused:
+    a factor of the part gets a new id, if none goes.
     Raises AbsoluteFactors, CannotMerge, BadSymbol, BadOption: nothing was sent.  Raises Refused (the map is as it was),
     Unavailable.
     """
     of_type("here", here, Map, "a Map")
+    checked_flag("settle", settle)
     if absolute not in _ABSOLUTE:
         raise CannotMerge(f"absolute is {absolute!r}; wanted one of {', '.join(_ABSOLUTE)}")
     given = batch_of("candidates", candidates)
+    for _ in range(_TRIES - 1):
+        try:
+            return _attach(here, letters, given, absolute, settle, timeout_s)
+        except Refused as problem:
+            # What the map had when it was asked is gone: the part is attached by another, or poses are taken out.
+            if problem.code not in ("unknown_factor", "unknown_variable"):
+                raise
+    return _attach(here, letters, given, absolute, settle, timeout_s)
+
+
+def _attach(here: Map, letters: str, given: Batch, absolute: str, settle: bool, timeout_s: float | None) -> Attached:
     kind = kind_of_candidates(given)
     # 1. The part, and that nothing joins it to the rest.
     graph = here.graph(timeout_s).batch
-    part, rest = _split(graph, _codes(letters))
+    part, rest = split_by_letters(graph, letters)
     # 2. What holds it in its own frame.
     roles = roles_of(graph)
     alone = [(group, ~hold_in_any_frame(group, roles)) for group in part.factors]
     held = _held(part, alone)
     if absolute == "refuse" and not is_gauge(part, held):
-        raise AbsoluteFactors(held)
+        raise AbsoluteFactors(held, _WORDS)
     # 3. Where it lies.
-    found = align_sides(side_of(here, rest, kind), side_of(here, part.variables, kind), given, timeout_s)
+    sides = [[_places(g, roles) for g in groups] for groups in (rest, part.variables)]
+    _check_candidates(given, kind, *sides)
+    found = align_sides(side_of(here, sides[0], kind), side_of(here, sides[1], kind), given, timeout_s)
     if found.verdict != ALIGNED or found.frame is None:
         return Attached(found)
+    anchors = found.anchors()
+    _check_held(part, alone, anchors)
+    if here.closures == "test":
+        _check_not_tested(here, anchors, timeout_s)
     # 4. One insert.
     changes, turned = _changes(part, alone, roles, found.frame)
-    anchors = found.anchors()
     batch = Batch((), (*turned, *anchors.factors))
     sent = as_trusted(batch) if here.closures == "test" else batch
     return Attached(found, here.insert(sent, changes=changes, settle=settle, timeout_s=timeout_s), held)
 
 
-def _codes(letters: str) -> set[int]:
-    """Raises CannotMerge, BadSymbol."""
-    if not of_type("letters", letters, str, 'letters, such as "b"'):
-        raise CannotMerge('letters is empty; wanted those of the part that is to be attached, such as "b"')
-    return {symbol(letter, 0) >> 56 for letter in letters}
+def _places(group: Variables, roles: Roles) -> Variables:
+    """Without mounts and the map's poses in other frames."""
+    return pick_variables(group, ~np.isin(group.keys, np.concatenate([roles.mounts, roles.frames])))
 
 
-def _split(graph: Batch, codes: set[int]) -> tuple[Batch, tuple[Variables, ...]]:
-    """The part with these letters, and the places of the rest.  Raises CannotMerge."""
-    wanted = list(codes)
-    names = np.concatenate([np.empty(0, np.int64), *(group.keys for group in graph.variables)])
-    inside = np.isin(names >> 56, wanted)
-    for which, missing in ((inside, "with these letters"), (~inside, "with other letters")):
-        if not which.any():
-            have = ", ".join(sorted({format_symbol(key)[:1] for key in names.tolist()}))
-            raise CannotMerge(f"the map has no variable {missing}; its letters are {have or 'none'}")
-    # Mounts and plain numbers are in no frame, so that both parts may have them.
-    aside = np.concatenate([mounts_of(graph), *(g.keys for g in graph.variables if VARIABLE_KINDS[g.kind].is_vector)])
-    aside = np.setdiff1d(aside, roles_of(graph).axes)
-    factors: list[Factors] = []
-    for group in graph.factors:
-        of_part, nowhere = np.isin(group.keys >> 56, wanted), np.isin(group.keys, aside)
-        some = np.asarray((of_part & ~nowhere).any(axis=1))
-        both = some & np.asarray((~of_part & ~nowhere).any(axis=1))
-        if both.any():
-            raise _joined(group, both)
-        if some.any():
-            factors.append(pick_factors(group, some))
-    groups = [(group, np.isin(group.keys >> 56, wanted)) for group in graph.variables]
-    part = tuple(pick_variables(group, chosen) for group, chosen in groups if chosen.any())
-    rest = tuple(pick_variables(group, ~chosen) for group, chosen in groups if not chosen.all())
-    return Batch(part, tuple(factors)), rest
-
-
-def _joined(group: Factors, which: np.ndarray) -> CannotMerge:
-    """The error that names some of the factors that join the part to the rest."""
-    pairs = [f"({', '.join(map(format_symbol, keys))})" for keys in group.keys[which][:_SHOWN].tolist()]
-    more = f" and {int(which.sum()) - _SHOWN} more" if which.sum() > _SHOWN else ""
-    return CannotMerge(
-        f"the part is joined to the rest already, by {name_of_kind(group.kind)} {', '.join(pairs)}{more}; wanted a "
-        "part that has no factor with the rest: keep candidates out of the map, and give them to `attach`"
+def _check_candidates(given: Batch, kind: str, rest: Sequence[Variables], part: Sequence[Variables]) -> None:
+    """Each is between a pose of the part and one of the rest.  Raises CannotMerge."""
+    pairs = np.concatenate([group.keys for group in given.factors])
+    of_rest, of_part = (
+        np.isin(pairs, np.concatenate([np.empty(0, np.int64), *(g.keys for g in side if g.kind == kind)]))
+        for side in (rest, part)
     )
+    if not (known := of_rest | of_part).all():
+        raise CannotMerge(
+            f"candidates name {keys_named(np.unique(pairs[~known]))}, no {kind} in the map's frame; wanted poses that "
+            "the map has: leave out candidates whose poses are gone (`Map.estimate` has those that are there)"
+        )
+    if (one_side := of_rest.all(axis=1) | of_part.all(axis=1)).any():
+        raise CannotMerge(
+            f"candidates are between two poses of one side: {pairs_named(pairs[one_side])}; wanted a pose of the part "
+            "and one of the rest: insert those of one side into the map, and leave them out here"
+        )
+
+
+def _check_held(part: Batch, alone: Sequence[tuple[Factors, np.ndarray]], anchors: Batch) -> None:
+    """All of the part hangs on a candidate that agrees: else it would go to a place that nobody measured."""
+    keys = np.concatenate([np.empty(0, np.int64), *(group.keys for group in _moving(part))])
+    ends = np.concatenate([group.keys.ravel() for group in anchors.factors])
+    lost = adrift(keys, [pick_factors(group, ~which) for group, which in alone], ends)
+    if lost.size:
+        raise CannotMerge(
+            f"no factor joins {keys_named(lost)} to a pose of a candidate that agrees, so that nothing says where "
+            f"{'it is' if lost.size == 1 else 'they are'}; wanted a part that hangs together. Attach what hangs "
+            "together one by one, under letters of its own, or give candidates of each"
+        )
+
+
+def _check_not_tested(here: Map, anchors: Batch, timeout_s: float | None) -> None:
+    """None of them is a suspect already, which would count twice when it is believed.  Raises CannotMerge."""
+    found = here.ask.suspects(False, timeout_s).result()
+    pairs = np.sort(np.concatenate([group.keys for group in anchors.factors]), axis=1)
+    pending = np.array([state == "suspect" for state in found.states], bool)
+    same = pending & np.array([(pairs == np.sort(keys)).all(axis=1).any() for keys in found.keys], bool)
+    if same.any():
+        ids = ", ".join(map(str, found.factors[same].tolist()))
+        raise CannotMerge(
+            f"the map tests candidates that agree already, and may count them twice: {pairs_named(found.keys[same])}; "
+            f"take these suspects out with `Changes().remove_factors([{ids}])`, and attach again"
+        )
 
 
 def _moving(part: Batch) -> list[Variables]:
@@ -172,12 +203,17 @@ def _changes(
     """What brings the part to where it lies, and factors of it that have other numbers there."""
     gone, turned = list[I64](), list[Factors]()
     for group, which in alone:
+        gone.append(_ids(group)[which])
+        if which.all():
+            continue
         stay = pick_factors(group, ~which)
         there = transform_factors(stay, T, roles)
         others = _differ(stay, there)
-        gone += [_ids(group)[which], _ids(stay)[others]]
+        gone.append(_ids(stay)[others])
         if others.any():
             turned.append(pick_factors(there, others)._replace(ids=None))
+    if not sum(map(len, gone)):
+        gone, turned = _one_anew(alone)
     changes = Changes()
     if (ids := np.concatenate([np.empty(0, np.int64), *gone])).size:
         changes.remove_factors(ids.tolist())
@@ -186,6 +222,19 @@ def _changes(
         changes.free(*fixed)
     changes.place([g._replace(values=roles.moved(g.kind, g.keys, _values(g), T)) for g in places], carry=True)
     return changes, turned
+
+
+def _one_anew(alone: Sequence[tuple[Factors, np.ndarray]]) -> tuple[list[I64], list[Factors]]:
+    """The oldest factor of the part, which goes and comes again.
+
+    Of two clients that attach one part at the same time the second names a factor that is gone: it is refused, where
+    the candidates would be in the map twice.
+    """
+    oldest = min((g for g, _ in alone if g.keys.size), key=lambda g: int(_ids(g).min()), default=None)
+    if oldest is None:
+        return [], []
+    row = _ids(oldest) == _ids(oldest).min()
+    return [_ids(oldest)[row]], [pick_factors(oldest, row)._replace(ids=None)]
 
 
 def _differ(one: Factors, other: Factors) -> np.ndarray:

@@ -37,6 +37,10 @@ ABSOLUTE = ("refuse", "leave_out", "keep")
 _PRIORS = ("prior_se2", "prior_se3")
 _BETWEEN = ("between_se2", "between_se3")
 _SHOWN = 5
+_HELD_TWICE = (
+    "the other map says where it is in its own frame more than once ({}), which is wrong in this one; "
+    'nothing was merged. absolute="leave_out" merges it without them, "keep" as it is, if both have one frame'
+)
 
 
 class KeyCollision(Problem):
@@ -68,13 +72,8 @@ class AbsoluteFactors(Problem):
 
     code = "absolute_factors"
 
-    def __init__(self, held: Mapping[str, int]) -> None:
-        listed = ", ".join(f"{count} {kind}" for kind, count in held.items())
-        super().__init__(
-            f"the other map says where it is in its own frame more than once ({listed}), which is wrong in this one; "
-            'nothing was merged. absolute="leave_out" merges it without them, "keep" as it is, if both have one frame',
-            **held,
-        )
+    def __init__(self, held: Mapping[str, int], said: str = _HELD_TWICE) -> None:
+        super().__init__(said.format(", ".join(f"{count} {kind}" for kind, count in held.items())), **held)
 
 
 class CannotMerge(Problem):

@@ -8,7 +8,7 @@ from factorbus.cli.output.exits import REFUSED, Stopped
 from factorbus.proto.problems import Problem
 
 # What a message says to do begins behind one of these.
-_MARKS = re.compile(r"(?<=nothing was merged\. )|(?<=; )")
+_MARKS = re.compile(r"(?<=nothing was merged\. )|(?<=nothing was attached\. )|(?<=; )")
 _CHANGE = re.compile(r"^[a-z_]+: (?=there is no variable)")
 
 
