@@ -77,6 +77,7 @@ def parse(words: list[str]) -> None:
 @pytest.fixture(autouse=True)
 def _somewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot1.yaml").write_text("/**:\n  ros__parameters:\n    map: yard\n")  # read while it is parsed
     monkeypatch.setattr("factorbus.cli.process.options.os.path.isdir", lambda _: True)
     monkeypatch.setattr(Path, "is_dir", lambda path: "." not in path.name)  # folders that examples write to
     monkeypatch.setattr("factorbus.cli.process.options.os.access", lambda *_: True)

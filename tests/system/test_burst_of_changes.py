@@ -147,7 +147,7 @@ def test_killed_in_the_middle_of_changes_none_that_was_answered_is_lost_and_none
         assert stats["variables"] == 400 + sum(n % 11 == 10 for n in range(count))
     running.end(signal.SIGKILL)
     check_journal(tmp_path / "journal" / "m", count)
-    assert verify.callback(("m",), tmp_path / "journal") == 0, "from the beginning, to the bit"
+    assert verify.callback(("m",), tmp_path / "journal", as_json=False) == 0, "from the beginning, to the bit"
     again = services(tmp_path / "journal")
     with connect(again.start(), client="viewer", timeout_s=PATIENCE_S) as bus, bus.map("m", create=False) as viewer:
         assert rows(viewer.ask_estimate().variables) == rows(estimate.variables)

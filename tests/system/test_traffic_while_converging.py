@@ -71,7 +71,7 @@ def test_killed_amid_the_traffic_of_others_it_comes_to_the_same_bits(
         np.testing.assert_array_equal(weights[factors - 1], was * 2.0**KILLS)
         assert estimate.revision == robot.stats()["revision"]
     running.end(signal.SIGKILL)
-    assert verify.callback(("m2",), folder) == 0, "from the beginning, to the bit"
+    assert verify.callback(("m2",), folder, as_json=False) == 0, "from the beginning, to the bit"
     again = services(folder)
     with connect(again.start(), client="viewer", timeout_s=PATIENCE_S) as bus, bus.map("m2", create=False) as viewer:
         found = viewer.ask_estimate()
