@@ -28,12 +28,13 @@ from factorbus.client.merging import (
     as_trusted,
     hold_in_any_frame,
     is_gauge,
+    keys_named,
 )
-from factorbus.client.parts import adrift, keys_named, pairs_named, split_by_letters
-from factorbus.client.roles import Roles, roles_of, split_mounts
+from factorbus.client.parts import adrift, keys_in_no_frame, pairs_named, split_by_letters
+from factorbus.client.roles import Roles, roles_of
 from factorbus.client.transform_factors import transform_factors
 from factorbus.proto.arrays import F64, I64
-from factorbus.proto.kinds import VARIABLE_KINDS, name_of_kind
+from factorbus.proto.kinds import name_of_kind
 from factorbus.proto.messages import Accepted, Batch, Factors, Variables
 from factorbus.proto.problems import Refused
 from factorbus.proto.roles import pick_factors, pick_variables
@@ -179,10 +180,8 @@ def _check_not_tested(here: Map, anchors: Batch, timeout_s: float | None) -> Non
 
 def _moving(part: Batch) -> list[Variables]:
     """All but mounts and plain numbers, which are the same in every frame."""
-    axes = roles_of(part).axes
-    groups = [
-        (g, np.isin(g.keys, axes) | (not VARIABLE_KINDS[g.kind].is_vector)) for g in split_mounts(part)[1].variables
-    ]
+    aside = keys_in_no_frame(part)
+    groups = [(group, ~np.isin(group.keys, aside)) for group in part.variables]
     return [pick_variables(group, chosen) for group, chosen in groups if chosen.any()]
 
 

@@ -50,8 +50,8 @@ class KeyCollision(Problem):
 
     def __init__(self, keys: I64, where: str) -> None:
         super().__init__(
-            f"{_names(keys)} would be there twice: {where}; nothing was merged. Give the variables of the other map "
-            'letters of their own, such as letters={"x": "y"}'
+            f"{keys_named(keys)} would be there twice: {where}; nothing was merged. Give the variables of the other "
+            'map letters of their own, such as letters={"x": "y"}'
         )
 
 
@@ -215,7 +215,7 @@ def _check_ends(anchors: Batch, here: Estimate, renamed: Batch) -> None:
     ends = [group.keys.reshape(-1) for group in anchors.factors]
     missing = np.setdiff1d(np.concatenate([np.empty(0, np.int64), *ends]), known)
     if missing.size:
-        raise NoAnchor(f"the anchors name {_names(missing)}, which neither this map has nor the other as renamed")
+        raise NoAnchor(f"the anchors name {keys_named(missing)}, which neither this map has nor the other as renamed")
 
 
 def _relative(batch: Batch, absolute: str, roles: Roles) -> tuple[Batch, dict[str, int]]:
@@ -334,6 +334,7 @@ def _values(group: Variables) -> F64:
     return group.values
 
 
-def _names(keys: I64) -> str:
+def keys_named(keys: I64) -> str:
+    """The first of them, and how many more there are."""
     more = f" and {keys.size - _SHOWN} more" if keys.size > _SHOWN else ""
     return ", ".join(format_symbol(int(key)) for key in keys[:_SHOWN]) + more

@@ -67,12 +67,6 @@ def adrift(keys: I64, factors: Sequence[Factors], held: I64) -> I64:
     return np.array([key for key in root if find(key) not in reached], np.int64)
 
 
-def keys_named(keys: Sequence[int] | I64) -> str:
-    """The first of them, and how many more there are."""
-    more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
-    return ", ".join(format_symbol(int(key)) for key in keys[:_SHOWN]) + more
-
-
 def pairs_named(pairs: I64) -> str:
     """The keys of the first of some factors, and how many more there are."""
     more = f" and {len(pairs) - _SHOWN} more" if len(pairs) > _SHOWN else ""
