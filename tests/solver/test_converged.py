@@ -272,7 +272,8 @@ def test_stiff_links_beside_a_weak_prior_are_taken(sigma: float) -> None:
 
 @pytest.mark.parametrize("pairs", [1, 3, 7])
 def test_links_so_stiff_that_pivots_are_raised_do_not_end_a_step(pairs: int) -> None:
-    """Σ error² says nothing of a direction whose pivot was raised: it said converged at 1.04 times the optimum."""
+    """Σ error² says nothing of a direction whose pivot was raised: it said converged at 1.04 times the optimum.  Damped
+    steps took off 1e-6 of χ² each, further than anybody waits."""
     solver, plain = Solver(), Solver(BATCH)
     for step in WORLDS["manhattan"](1500, 5):
         for each in (solver, plain):
@@ -286,13 +287,8 @@ def test_links_so_stiff_that_pivots_are_raised_do_not_end_a_step(pairs: int) -> 
     # A chain that nothing else holds fits exactly: the optimum is that of the map without it, which has no such link.
     optimum = plain.step(settle=True).chi2
     for report in said:
-        assert not report.converged or report.chi2 <= 1.001 * optimum
-    if pairs > 1:  # Levenberg-Marquardt goes on lowering χ² by a little, further than anybody waits
-        assert not said[-1].converged
-        return
-    assert said[-1].converged
-    # Rounding of 1e16 in R hides what holds the map: it stops 3e-5 above the optimum, where no step gains anything.
-    assert said[-1].chi2 == pytest.approx(optimum, rel=1e-4)
+        assert report.converged
+        assert report.chi2 == pytest.approx(optimum, rel=1e-6)
     # What adds nothing does not take back that it has converged; a loop that pulls does.
     last = 1499
     assert put(

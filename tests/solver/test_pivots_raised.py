@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from factorbus.client import Draft
+from factorbus.proto.symbols import symbol
 from factorbus.simulate import WORLDS
 from factorbus.solver import Solver
 from factorbus.solver.bayes_tree import steps
@@ -26,7 +28,17 @@ def test_a_tree_that_is_not_where_damped_steps_ended_has_not_converged(monkeypat
         result.chi2 *= 0.5
         return result
 
+    pulls = Draft().prior_se2("x300", value_of(solver, "x300") + 0.3, sigmas=(0.1, 0.1, 0.1)).batch()
     said = copied(solver)
+    said.stage(pulls)
+    solver.stage(pulls)
     assert any(said.step().converged for _ in range(8))
     monkeypatch.setattr(steps, "minimize", elsewhere)
     assert not any(solver.step().converged for _ in range(8))
+
+
+def value_of(solver: Solver, name: str) -> np.ndarray:
+    """The estimate of a variable."""
+    key = symbol(name[0], int(name[1:]))
+    (found,) = (group.values[group.keys == key][0] for group in solver.estimate() if key in group.keys)
+    return found

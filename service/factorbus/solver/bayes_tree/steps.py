@@ -46,7 +46,7 @@ _ASKED = "asked to settle"
 _CORRECTED = "residuals taken anew in a chord step"
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
-_GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
+_GOES_ON = "pivots were raised above rounding: conjugate gradients to the optimum"
 _WITHIN = "numbers would have left their bounds: Levenberg-Marquardt within them"
 _STALLS = "a step with nothing new did not lower χ²: Levenberg-Marquardt to the optimum"
 _NO_BUDGET = (0, 0.0, 0.0, 0.0, True)
@@ -107,7 +107,7 @@ class TreeSteps:
         if not settle and not escaped and (stands or (bounded and self._is_tolerable)):
             self._damping = 0.0
             return self._report(started, compiled, None, because, budget if bounded else 0.0)
-        result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because, escaped)
+        result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because, escaped, bounded)
         return self._report(started, compiled, result, because, budget if bounded else 0.0)
 
     def resume(self, settle: bool) -> StepReport:
@@ -225,14 +225,15 @@ class TreeSteps:
         system.factorize(0.0)
         return f"only several factors together hold {counted(suspects.size, 'new variable')}"
 
-    def _complete(self, settle: bool, because: str, escaped: bool) -> tuple[Minimization | None, str]:
+    def _complete(self, settle: bool, because: str, escaped: bool, bounded: bool) -> tuple[Minimization | None, str]:
         """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
         tree, after = self._tree, self._tree.state.item(tl.S_AFTER)
         chi2, chi2_before = tree.totals.item(tl.T_CHI2), tree.totals.item(tl.T_BEFORE)
         result, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
         taken_back = escaped
         continues = self._graph.mark() == self._mark
-        goes_on = after & tl.RAISED and continues and not self._is_within(_AT_END, chi2)
+        share = _AT_END if continues else self._options.converged_share
+        goes_on = after & tl.RAISED and not bounded and not self._is_within(share, chi2)
         if settle or escaped or worse or rises or goes_on or self._stalls:
             tree.exchange()
             before = self._graph.values.copy()
@@ -243,14 +244,9 @@ class TreeSteps:
             result = self._batch(before, settle, continues, taken_back)
             reasons = (settle, _ASKED), (escaped, _WITHIN), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON)
             because = next((reason for holds, reason in reasons if holds), _STALLS)
-            # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum: nothing by the
-            # tree's own step, too, which may take off what damped ones cannot.  It says nothing where the tree could
-            # not be eliminated where these ended, and is elsewhere.
-            chi2 = tree.totals.item(tl.T_CHI2)
-            there = goes_on and chi2 <= (1.0 + _AT_END) * result.chi2 + LEAST_CHI2
-            if there and chi2_before - chi2 <= _AT_END * self._share:
-                result.converged = True
             if result:
+                # Where the tree could not be eliminated where these steps ended it is elsewhere.
+                result.converged &= tree.totals.item(tl.T_CHI2) <= (1.0 + _AT_END) * result.chi2 + LEAST_CHI2
                 tree.totals[tl.T_WHOLE], tree.state[tl.S_AFTER] = tree.totals[tl.T_CHI2], 0
                 # Of the optimum of a batch that has not converged nothing is known.
                 tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2] if result.converged else 0.0
@@ -281,7 +277,7 @@ class TreeSteps:
     def _system(self, graph: FactorGraph) -> System:
         """All normal equations at the estimate, apart from the tree."""
         options = self._options
-        system = System(graph, Incremental(Elimination(options), options))
+        system = System(graph, Incremental(Elimination(options), options), self._tree.raised)
         system.blocks.extend(graph, _START)
         system.factor.moved()
         return system
@@ -299,7 +295,7 @@ class TreeSteps:
         system.within = self.within
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
         rule = (further_rule if continues else ordinary_rule)(options, options.batch_tolerance)
-        damping = self._damping if continues and not settle else 0.0
+        damping = self._damping if continues and not settle and not self._tree.raised else 0.0
         if settle:
             rule = settling_rule(options)
         elif damping:
@@ -308,6 +304,9 @@ class TreeSteps:
         if result.iterations or taken_back or not settle:
             self._tree.move_all()
             self._tree.step()
+            if self._tree.state.item(tl.S_RAISED) == tl.RAISED_PIVOT:
+                self._tree.move_all(damped=True)
+                self._tree.step()
             most = result.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN
             self._at_linearization = not self._tree.totals[tl.T_CHI2] <= most or self._has_escaped
             if self._at_linearization:

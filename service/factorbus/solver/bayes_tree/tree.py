@@ -117,15 +117,18 @@ class CliqueTree(Arenas):
         """The variable whose pivot made the last step fail."""
         return int(self.state[tl.S_FAILED])
 
-    def move_all(self) -> None:
-        """The next step moves the linearization points of all variables to the estimate."""
+    def move_all(self, damped: bool = False) -> None:
+        """The next step moves the linearization points of all variables to the estimate; damped: and damps all pivots,
+        which later ones do, too.
+        """
         var = self._graph.var[: self.state[tl.S_VARIABLES]]
         free = np.flatnonzero(var[:, at.V_COLUMN] >= 0)
         self.node[free, tl.N_FLAGS] = 1
         self.pending[: free.size] = free
         self.state[tl.S_PENDING] = free.size
         self.state[[tl.S_DUE, tl.S_ONCE]] = 1
-        self.state[tl.S_RAISED] = 0
+        if self.state[tl.S_RAISED] != tl.DAMPED:
+            self.state[tl.S_RAISED] = tl.DAMPED if damped else 0
 
     def reset_to_linearization(self) -> None:
         """Put the estimate back to the linearization points: the solution of the linear problem is not taken."""

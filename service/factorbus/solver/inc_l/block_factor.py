@@ -25,6 +25,7 @@ from factorbus.solver.kernels.inc_l.records import BlockRows
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.sparse.blocks import HessianBlocks
+from factorbus.solver.sparse.pivots import least_pivot
 from factorbus.solver.sparse.symbolic import Symbolic
 
 _NEW_NUMBERS = 6 * 12  # doubles a new row takes at most
@@ -123,6 +124,11 @@ class BlockFactor(Arenas):
         """Bytes in use of all arenas."""
         positions, index, numbers = (int(self.counts[entry]) for entry in (br.POSITIONS, br.INDEX, br.NUMBERS))
         return 8 * (positions * (br.RECORD + 1) + index + numbers + self.d.size)
+
+    def least_pivot(self) -> float:
+        """The least R_kk²; infinite without any."""
+        rec = self.rec[: self.counts[br.POSITIONS]]
+        return least_pivot(self.numbers, rec[:, br.ROW], rec[:, br.DIM], rec[:, br.LD])
 
     def nonzeros(self) -> int:
         """Doubles of R on and above the diagonal, the zeros of joined fronts among them."""

@@ -132,6 +132,10 @@ class Incremental:
         self._d = np.zeros(self._d.size)
         self._rows_have_d = False
 
+    def least_pivot(self) -> float:
+        """The least R_kk² of the factor made last."""
+        return self.rows.least_pivot() if self._solves is Where.ROWS else self.elimination.least_pivot()
+
     def cost(self) -> tuple[int, float]:
         """Nonzeros of R, and the flops of its last factorization."""
         symbolic = self.elimination.symbolic

@@ -210,6 +210,9 @@ class IncrementalSteps:
         if suspects.size:
             self._system.factor.moved()
             return Plan("full", "only the numbers of Λ can tell whether all new variables are held")
+        if self._system.rounded:
+            self._system.factor.moved()
+            return Plan("full", "R is rounding where factors are stiff, and steps go by the factors")
         return self._system.factor.apply(self._graph, self._system.blocks, self._done.graph, watch)
 
     def _solve(
@@ -234,7 +237,7 @@ class IncrementalSteps:
         if result is None:
             if self._mode.batch_every:
                 system.relinearize()
-            have_factor = self._done.damping == 0.0 and not goes_on and system.factor.serve()
+            have_factor = self._done.damping == 0.0 and not goes_on and system.serve()
             result = minimize(system, chi2, self._done.damping, rule, have_factor)
             if not (self._mode.updates and result.converged and self._keeps(have_factor, result)):
                 system.have_lambda()

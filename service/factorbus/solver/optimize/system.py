@@ -11,9 +11,11 @@ from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.retract import differing, move
+from factorbus.solver.kernels.sparse.partial_cholesky import ROUNDING
+from factorbus.solver.optimize.conjugate import ConjugateGradients
 from factorbus.solver.optimize.factor import Factor
 from factorbus.solver.report import Stopwatch
-from factorbus.solver.sparse.anchors import find_loose
+from factorbus.solver.sparse.anchors import find_loose, find_loose_by_themselves
 from factorbus.solver.sparse.blocks import HessianBlocks
 
 R = TypeVar("R", bound=Factor)
@@ -27,14 +29,16 @@ class System(Generic[R]):
     """Λ, η and R of a graph at its present values.  A `LeastSquares` between `begin` and `end` of a step.
 
     within: what would leave its bounds counts as having an infinite χ², so that no step leads there
+    rounded: R has lost to rounding what some factors say, so steps are made by conjugate gradients; once, always
     """
 
-    NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph", "within")
+    NOT_KEPT = ("_before", "_exact", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph", "within")
 
-    def __init__(self, graph: FactorGraph, factor: R) -> None:
+    def __init__(self, graph: FactorGraph, factor: R, rounded: bool = False) -> None:
         self.graph = graph
         self.blocks = HessianBlocks()
-        self.factor = factor
+        self.factor, self.rounded = factor, rounded
+        self._exact = ConjugateGradients(factor)
         self._before: F64 = np.zeros(0)
         self._kept: F64 = np.zeros(0)
         self._trial: F64 = np.zeros(0)
@@ -59,25 +63,40 @@ class System(Generic[R]):
         """Factorize Λ + damping · diag Λ; −1, or the block column whose pivot failed.  Raises Underconstrained."""
         if not self.drifted:
             self.have_lambda()
-        failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
+        failed = self._solver.factorize(self.graph, self.blocks, damping, self._watch)
         if failed >= 0:
             failed = self._factorize_rest(failed, damping)
+        if damping == 0.0 and not (self.rounded or self._suspects.size):
+            self.rounded = failed >= 0 or self._has_lost()
+            if self.rounded:
+                failed = self._solver.factorize(self.graph, self.blocks, damping, self._watch)
         if self._suspects.size and damping == 0.0:
             if failed >= 0:
                 raise self.underconstrained(self.variable_of(failed))
-            loose = find_loose(self.graph, self.blocks, self._suspects, self._solve)
+            loose, suspects = -1, self._suspects
+            if self.rounded:
+                loose, suspects = find_loose_by_themselves(self.graph, self.blocks, suspects)
+            if loose < 0 and suspects.size:
+                loose = find_loose(self.graph, self.blocks, suspects, self._solve)
             if loose >= 0:
                 raise self.underconstrained(loose)
             self._suspects = self._suspects[:0]
         return failed
 
+    def serve(self) -> bool:
+        """Solve with the R that is there, if there is one that has lost nothing."""
+        if self.rounded or not self.factor.serve():
+            return False
+        self.rounded = self._has_lost()
+        return not self.rounded
+
     def decrease(self) -> float:
         """dᵀd = δᵀη by the factor made last and the present gradient."""
-        return self.factor.decrease(self.blocks.eta[: self.graph.counts[at.SCALARS]], self._watch)
+        return self._solver.decrease(self.blocks.eta[: self.graph.counts[at.SCALARS]], self._watch)
 
     def step(self) -> F64:
         """The δ of the last `decrease`."""
-        return self.factor.step(self._watch)
+        return self._solver.step(self._watch)
 
     def linearize_at(self, step: F64) -> float:
         """χ² at x ⊞ δ, linearized there aside."""
@@ -116,7 +135,7 @@ class System(Generic[R]):
         self.factor.turned()
         left = self.decrease()
         self.blocks.eta[: self.graph.counts[at.SCALARS]] = 0.0
-        self.factor.rest()
+        self._solver.rest()
         self._have_lambda, self._spare_is_here, self._moved, self.drifted = False, False, True, True
         return left
 
@@ -182,6 +201,15 @@ class System(Generic[R]):
         """The variable that has this block column."""
         return int(np.flatnonzero(self.graph.var[: self.graph.counts[at.VARIABLES], at.V_COLUMN] == column)[0])
 
+    @property
+    def _solver(self) -> Factor:
+        """What makes steps."""
+        return self._exact if self.rounded else self.factor
+
+    def _has_lost(self) -> bool:
+        """Whether a pivot is no more than the rounding of the largest entry."""
+        return self.factor.least_pivot() <= ROUNDING * self.blocks.largest(self.graph)
+
     def _factorize_rest(self, failed: int, damping: float) -> int:
         """Factorize Λ with ones where its diagonal is zero, `suspects` apart: what every loss has set aside rests
         where it is, as η is zero there, and the rest moves.  −1, or the block column whose pivot failed."""
@@ -189,7 +217,7 @@ class System(Generic[R]):
         resting = self.blocks.unweighted(self.graph, np.setdiff1d(free, self._suspects, assume_unique=True))
         if resting.size:
             entries = self.blocks.put_ones(self.graph, resting)
-            failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
+            failed = self._solver.factorize(self.graph, self.blocks, damping, self._watch)
             self.blocks.data[entries] = 0.0
             self.factor.moved()
         return failed

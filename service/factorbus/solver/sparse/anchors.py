@@ -22,6 +22,8 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 
 # A variance this many times what the variable's own factors alone would leave is no longer a number.
 _LOOSE = 1e12
+# Scalars of variables that are looked at together without the rest.
+_TOGETHER = 1000
 # The share of its diagonal that the least known direction of a linear factor has to keep, for it to determine.
 _ROOM = 1e-8
 _NONE = np.empty(0, np.int64)
@@ -97,3 +99,47 @@ def find_loose(graph: FactorGraph, blocks: HessianBlocks, suspects: I64, solve: 
     if answer[loosest] <= _LOOSE:
         return -1
     return int(suspects[np.searchsorted(rows[:, at.V_SCALAR], loosest, side="right") - 1])
+
+
+def find_loose_by_themselves(graph: FactorGraph, blocks: HessianBlocks, suspects: I64) -> tuple[int, I64]:
+    """The suspect that is free to move where nothing else moves, or −1; and the suspects of which this does not tell.
+
+    All other variables are held without them, so Λ is positive definite where its part of the suspects is: an
+    eigenvalue of that part, normalized, is no more than 1 / `_LOOSE`.  Told where no more than `_TOGETHER` scalars hang
+    together.
+    """
+    place = np.full(int(graph.counts[at.COLUMNS]), -1)
+    columns = graph.var[suspects, at.V_COLUMN]
+    place[columns] = np.arange(suspects.size)
+    among = np.flatnonzero((place[blocks.rows] >= 0) & (place[blocks.cols] >= 0))
+    row, col, offset = place[blocks.rows[among]], place[blocks.cols[among]], blocks.offsets[among]
+    group = _groups(suspects.size, row, col)
+    dims, untold = graph.dims[columns], []
+    for g in range(int(group.max(initial=-1)) + 1):
+        members = np.flatnonzero(group == g)
+        size = int(dims[members].sum())
+        if size > _TOGETHER:
+            untold.append(suspects[members])
+            continue
+        start = np.zeros(suspects.size, np.int64)
+        start[members] = np.cumsum(dims[members]) - dims[members]
+        Lambda = np.zeros((size, size))
+        for k in np.flatnonzero(group[row] == g).tolist():
+            a, b, da, db = start[row[k]], start[col[k]], dims[row[k]], dims[col[k]]
+            block = blocks.data[offset[k] : offset[k] + da * db].reshape(da, db)
+            Lambda[a : a + da, b : b + db], Lambda[b : b + db, a : a + da] = block, block.T
+        D = np.sqrt(np.maximum(Lambda.diagonal(), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(Lambda / D / D[:, None])
+        if values[0] <= 1.0 / _LOOSE:
+            loosest = int(np.argmax(np.abs(vectors[:, 0])))
+            return int(suspects[members[np.searchsorted(start[members], loosest, side="right") - 1]]), _NONE
+    return -1, np.concatenate([_NONE, *untold])
+
+
+def _groups(count: int, row: I64, col: I64) -> I64:
+    """The number of the group that each of `count` variables is in, which pairs row, col join."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    _, group = connected_components(coo_array((np.ones(row.size), (row, col)), shape=(count, count)), directed=False)
+    return np.asarray(group, np.int64)

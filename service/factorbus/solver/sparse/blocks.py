@@ -65,6 +65,21 @@ class HessianBlocks:
             at_zero[dims == dim] = (self.data[_diagonal(rows[dims == dim], dim)] == 0.0).any(1)
         return variables[at_zero]
 
+    def diagonal(self, graph: FactorGraph) -> I64:
+        """(scalars,), where in `data` the diagonal of Λ is."""
+        out = np.empty(int(graph.counts[at.SCALARS]), np.int64)
+        var = graph.var[: graph.counts[at.VARIABLES]]
+        free = var[var[:, at.V_COLUMN] >= 0]
+        dims = graph.dims[free[:, at.V_COLUMN]]
+        for dim in np.unique(dims).tolist():
+            rows = free[dims == dim]
+            out[rows[:, at.V_SCALAR, None] + np.arange(dim)] = _diagonal(rows, dim)
+        return out
+
+    def largest(self, graph: FactorGraph) -> float:
+        """The largest entry of Λ's diagonal; 0 without any."""
+        return float(self.data[self.diagonal(graph)].max(initial=0.0))
+
     def put_ones(self, graph: FactorGraph, variables: I64) -> I64:
         """Set zeros on the diagonal of Λ to one where they are of the free `variables`; gives where in `data`."""
         found = []

@@ -15,6 +15,7 @@ from factorbus.solver.kernels.sparse.triangular_solve import (
     solve_fronts_transposed,
 )
 from factorbus.solver.sparse.ordering import integers
+from factorbus.solver.sparse.pivots import least_pivot
 from factorbus.solver.sparse.symbolic import Symbolic
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 from factorbus.wording import counted
@@ -78,6 +79,11 @@ class Cholesky:
         solve_fronts(symbolic.fronts, symbolic.separator, self._arena, x, self._room)
         into_insertion_order(symbolic.place, symbolic.starts, symbolic.dims, x, delta)
         return delta
+
+    def least_pivot(self) -> float:
+        """The least R_kk²; infinite without any."""
+        fronts = self._of(None).fronts
+        return least_pivot(self._arena, fronts[:, fr.ROWS], fronts[:, fr.PIVOTS], fronts[:, fr.LD_ROWS])
 
     def R(self) -> Any:  # noqa: N802  (the paper's letter)
         """R as a scipy CSC array, upper triangular, rows and columns in elimination order (`scalar_order`)."""

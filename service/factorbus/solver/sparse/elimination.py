@@ -52,6 +52,10 @@ class Elimination:
         """δ = PᵀR⁻¹d, in insertion order."""
         return self._cholesky.back(d)
 
+    def least_pivot(self) -> float:
+        """The least R_kk² of the factor made last."""
+        return self._cholesky.least_pivot()
+
     def memory_bytes(self) -> int:
         """Bytes of the fronts that were made last."""
         return 8 * self.symbolic.arena if self.symbolic else 0

@@ -15,7 +15,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.panels import take_off
-from factorbus.solver.kernels.sparse.partial_cholesky import LEAST_PIVOT
+from factorbus.solver.kernels.sparse.partial_cholesky import DAMPING, LEAST_PIVOT
 
 # Columns of `update`, a row for each orphan: where its update matrix is, its width, and the size of its block where it
 # was made for this elimination, else 0.
@@ -37,6 +37,18 @@ def number_columns(
             for a in range(dim):
                 floors[width + a] = -max(LEAST_PIVOT * scalars[1, d + a], noise)
         width += dim
+
+
+@part
+def damp_pivots(graph: Graph, tree: Tree, row: I64) -> None:
+    """Add `DAMPING` times what its own factors bring to each pivot of a clique whose numbers are zero."""
+    k = row[tl.C_ROWS]
+    for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
+        v = tree.lists[s]
+        d = graph.var[v, at.V_SCALAR]
+        for a in range(dim_of_variable(graph.var, v)):
+            put(tree.numbers, k, DAMPING * tree.scalars[1, d + a])
+            k += row[tl.C_LD] + 1
 
 
 @inline_kernel

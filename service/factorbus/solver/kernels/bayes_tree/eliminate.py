@@ -18,6 +18,7 @@ from factorbus.solver.kernels.bayes_tree.assemble import (
     UPDATE_AT,
     UPDATE_WIDTH,
     add_hessian,
+    damp_pivots,
     extend_add,
     front_of_clique,
     list_column_runs,
@@ -236,6 +237,8 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, queue: I64) -> tupl
         p, m, front = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], front_of_clique(row)
         number_columns(row, noise, var, node, lists, scalars, column, floors)
         clear_front(numbers, front)
+        if tree.state[tl.S_RAISED] == tl.DAMPED:
+            damp_pivots(graph, tree, row)
         anchored = 0
         for q in range(first_factor[f], first_factor[f + 1]):
             anchored |= int(not is_invariant(factor_of[q], var, fac))
@@ -261,7 +264,7 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, queue: I64) -> tupl
         if failed >= 0:
             return variable_at(failed, row, var, lists), flops
         if failed == RAISED:
-            tree.state[tl.S_RAISED] = 1
+            tree.state[tl.S_RAISED] = max(tree.state[tl.S_RAISED], tl.RAISED_PIVOT)
         flops += p * (p + m + 1) * (p + m + 1)
     return -1, flops
 

@@ -142,7 +142,7 @@ S_LARGEST = 50  # and no class above this one has any
 S_RELINEARIZING = 51  # flops of the last elimination that relinearized
 S_RISES = 52  # 1: the last round of the step raised χ²
 S_ONCE = 53  # 1: the step under way has one round
-S_RAISED = 54  # 1: a pivot was raised, so that R is not quite that of Λ
+S_RAISED = 54  # RAISED_PIVOT: one was raised, so that R is not quite that of Λ; or DAMPED: all are damped for that
 S_AFTER = 55  # why more than the step is to be done: sums of WORSE, ROSE, RAISED; 0: nothing
 S_EDITED = 56  # variables in `moved` whose factors were edited since the last step; they come first
 S_EDITED_AT = 57  # the last step that such factors went before
@@ -158,6 +158,9 @@ S_SIZE = S_FREE + 2 * CLASSES
 
 # What a step comes to.
 DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
+
+# In S_RAISED.
+RAISED_PIVOT, DAMPED = 1, 2
 
 # In S_AFTER: the step raised χ², or its last round did, or a pivot was raised.
 WORSE, ROSE, RAISED = 1, 2, 4

@@ -12,6 +12,7 @@ from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
 from factorbus.solver.kernels.bayes_tree.allocator import give_numbers, size_class, take_numbers
 from factorbus.solver.kernels.bayes_tree.assemble import (
     add_hessian,
+    damp_pivots,
     extend_add,
     front_of_clique,
     list_column_runs,
@@ -124,6 +125,8 @@ def renew(graph: Graph, tree: Tree, renewed: I64, n: int, largest_diagonal: floa
         p, m, front = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], front_of_clique(row)
         number_columns(row, ROUNDING * largest_diagonal, var, node, lists, scalars, column, floors)
         clear_front(numbers, front)
+        if state[tl.S_RAISED] == tl.DAMPED:
+            damp_pivots(graph, tree, row)
         for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
             f = node[lists[s], tl.N_OWN]
             while f >= 0:
@@ -138,7 +141,7 @@ def renew(graph: Graph, tree: Tree, renewed: I64, n: int, largest_diagonal: floa
             child = other[tl.C_NEXT]
         failed = factor_front(numbers, front, floors, 0, queue)
         if failed == RAISED:
-            state[tl.S_RAISED] = 1
+            state[tl.S_RAISED] = max(state[tl.S_RAISED], tl.RAISED_PIVOT)
         if failed >= 0:
             state[tl.S_FAILED] = variable_at(failed, row, var, lists)
             give_back_renewed(renewed, old, clique, numbers, state)

@@ -24,6 +24,9 @@ LEAST_PIVOT = 1e-12
 # The same of the largest Λₖₖ of all: its rounding, and that of its gradient, go on to what is eliminated later, and
 # what is known of anything by less is lost in them.  A map that only a prior of σ 1e5 rad holds would turn by 0.1 rad.
 ROUNDING = 2.0**-46
+# Where a pivot had to be raised, each Λₖₖ is multiplied by one plus this, some 30 times the rounding of one number:
+# that is positive definite, and no entry of R is more than it should be.
+DAMPING = 2.0**-48
 RAISED = -2  # what `factor_front` gives where it raised a pivot
 
 

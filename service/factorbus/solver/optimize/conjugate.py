@@ -1,0 +1,111 @@
+"""Steps that are exact where R is not: conjugate gradients on the factors, preconditioned by R.  MATH (6.4)"""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.kernels.jit.compile import F64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.multiply_hessian import multiply_hessian
+from factorbus.solver.optimize.factor import Factor
+from factorbus.solver.report import Stopwatch
+from factorbus.solver.sparse.blocks import HessianBlocks
+
+# By what Λ's diagonal is multiplied, less one, so that rounding leaves it positive definite: the first that does.
+_DAMPINGS = (2.0**-50, 2.0**-46, 2.0**-42, 2.0**-38)
+_ITERATIONS = 500  # at most
+_LEFT = 1e-12  # of the decrease that was found: what is left is no more, by R
+
+
+class ConjugateGradients:
+    """A `Factor` that solves by the Jacobians at the present values, and takes R of `factor` as preconditioner."""
+
+    def __init__(self, factor: Factor) -> None:
+        self._factor = factor
+        self._graph: FactorGraph | None = None
+        self._damped: F64 = np.empty(0)
+        self._step: F64 = np.empty(0)
+
+    def factorize(self, graph: FactorGraph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
+        """As `Factor.factorize`."""
+        self._graph, self._damped = graph, damping * blocks.data[blocks.diagonal(graph)]
+        failed = -1
+        for least in _DAMPINGS:
+            failed = self._factor.factorize(graph, blocks, damping + least, watch)
+            if failed < 0:
+                break
+        return failed
+
+    def decrease(self, eta: F64, watch: Stopwatch) -> float:
+        """δᵀη with (Λ + damping · diag Λ) δ = η; the next `step` gives this δ."""
+        g, x = eta.copy(), np.zeros(eta.size)
+        square, p = self._precondition(g, watch)
+        if not math.isfinite(square):
+            self._step = p
+            return square
+        found = 0.0
+        for _ in range(_ITERATIONS):
+            Ap = self._multiply(p)
+            curvature = float(p @ Ap)
+            if not curvature > 0.0:
+                break
+            size = square / curvature
+            x += size * p
+            g -= size * Ap
+            found += size * square
+            before = square
+            square, z = self._precondition(g, watch)
+            if not square > _LEFT * found:
+                break
+            p = z + square / before * p
+        watch.lap("solve")
+        self._step = x
+        return found
+
+    def step(self, watch: Stopwatch) -> F64:
+        """The δ of the last `decrease`."""
+        watch.lap("solve")
+        return self._step
+
+    def serve(self) -> bool:
+        """As `Factor.serve`: never, as it has no Jacobians then."""
+        return False
+
+    def turned(self) -> None:
+        """As `Factor.turned`."""
+        self._factor.turned()
+
+    def rest(self) -> None:
+        """As `Factor.rest`."""
+        self._factor.rest()
+
+    def moved(self) -> None:
+        """As `Factor.moved`."""
+        self._factor.moved()
+
+    def forget(self) -> None:
+        """As `Factor.forget`."""
+        self._factor.forget()
+
+    def least_pivot(self) -> float:
+        """As `Factor.least_pivot`."""
+        return self._factor.least_pivot()
+
+    def memory_bytes(self) -> int:
+        """As `Factor.memory_bytes`."""
+        return self._factor.memory_bytes() + 5 * self._damped.nbytes
+
+    def _precondition(self, g: F64, watch: Stopwatch) -> tuple[float, F64]:
+        """|R⁻ᵀ g|² and R⁻¹ R⁻ᵀ g."""
+        square = self._factor.decrease(g, watch)
+        return square, self._factor.step(watch)
+
+    def _multiply(self, x: F64) -> F64:
+        graph = self._graph
+        if graph is None:
+            raise ValueError("there is no factor to solve with: factorize comes first")
+        out = self._damped * x
+        factors = int(graph.counts[at.FACTORS])
+        multiply_hessian(factors, graph.var, graph.fac, graph.values, graph.payload, x, out)
+        return out
