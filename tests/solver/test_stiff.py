@@ -14,6 +14,7 @@ from factorbus.client import Draft
 from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.divergence import copied
 from factorbus.solver.errors import Underconstrained
 from factorbus.solver.kernels.model import layout as at
@@ -119,6 +120,24 @@ def test_what_nothing_holds_is_refused_beside_stiff_links(mode: str) -> None:
     put(solver, draft.bearing_se2("x30", "l0", towards[1], sigmas=0.01))
     found = next(group.values[0] for group in solver.estimate() if symbol("l", 0) in group.keys)
     np.testing.assert_allclose(found, point, atol=1e-3)
+
+
+@pytest.mark.parametrize("space", [PLANE, SPACE])
+@pytest.mark.parametrize(("mode", "stiff", "prior"), [("auto", 1e-7, 0.1), ("inc-l", 1e-7, 0.1), ("auto", 1e-8, 1e5)])
+def test_covariances_are_those_of_links_that_are_no_rounding(mode: str, stiff: float, prior: float, space: int) -> None:
+    """σ of a pose was half of what it is, and a 400th where a weak prior holds the map."""
+    joint = []
+    for of, sigma in ((mode, stiff), ("inc-l", RIGID)):
+        solver = Solver(Options(mode=of))
+        for draft in rig(space, 120, 4, prior, sigma):
+            put(solver, draft)
+        graph, source = graph_in(solver), solver.covariances
+        ends = np.array([graph.find(symbol("x", n)) for n in (119, 50)])
+        joint.append(CovarianceBlocks(source.try_view() or source.factored()).joint(ends))
+    sigmas = [np.sqrt(each.diagonal()) for each in joint]
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=2e-2)
+    correlations = [each / np.outer(of, of) for each, of in zip(joint, sigmas, strict=True)]
+    np.testing.assert_allclose(correlations[0], correlations[1], atol=2e-2)
 
 
 @pytest.mark.parametrize("name", ["plane", "space", "mounted"])

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 
 from factorbus.solver.bayes_tree.steps import TreeSteps
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.live import Live
 from factorbus.solver.covariance.square_root import (
     SquareRoot,
@@ -22,13 +23,23 @@ class CovarianceSource:
 
     def __init__(self, graph: FactorGraph, stepper: Stepper) -> None:
         self._graph = graph
-        self._tree = stepper.tree if isinstance(stepper, TreeSteps) else None
-        self._live = Live(graph, self._tree) if self._tree else None
+        self._steps = stepper if isinstance(stepper, TreeSteps) else None
+        self._kept = Live(graph, self._steps.tree) if self._steps else None
+
+    @property
+    def _tree(self) -> CliqueTree | None:
+        """Where R is; None: nowhere, or it is rounding in part, as pivots were raised."""
+        return self._steps.tree if self._steps and not self._steps.tree.raised else None
+
+    @property
+    def _live(self) -> Live | None:
+        return self._kept if self._tree else None
 
     def factored(self) -> SquareRoot:
         """A copy of R and of all that it is of, for other threads.
 
-        In the mode "bayes-tree" that is its R, linearized where it is; in the others one made here, at the estimate.
+        In the mode "bayes-tree" that is its R, linearized where it is; in the others, and where pivots were raised, one
+        made here, at the estimate.
         """
         return copied_square_root(self._graph, self._tree) if self._tree else computed_square_root(self._graph)
 
@@ -42,7 +53,7 @@ class CovarianceSource:
     def try_view(self) -> SquareRoot | None:
         """The same without a copy, for questions about a few variables: until the next step, on the thread that steps.
 
-        None: this mode keeps no R that could be read in place; `factored` makes one.
+        None: there is no R that could be read in place, or it is rounding in part; `factored` makes one.
         """
         return viewed_square_root(self._graph, self._tree) if self._tree else None
 

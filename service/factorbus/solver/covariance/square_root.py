@@ -8,8 +8,10 @@ from factorbus.solver import errors
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.kernels.recursion import list_cliques
 from factorbus.solver.covariance.kernels.rows import copy_rows, size_of_rows
+from factorbus.solver.covariance.orthogonal import replace_rows
 from factorbus.solver.graph.arenas import Arenas
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_rows import is_first
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
@@ -66,7 +68,9 @@ def viewed_square_root(graph: FactorGraph, tree: CliqueTree) -> SquareRoot:
 
 
 def computed_square_root(graph: FactorGraph) -> SquareRoot:
-    """The same for a graph that is solved in another way: factorized here at its values.  Raises Underconstrained."""
+    """The same for a graph that is solved in another way, or whose R is rounding: factorized here at its values, where
+    pivots had to be raised by orthogonal transformations.  Raises Underconstrained.
+    """
     copy = graph.copied()
     values = copy.values.copy()
     # The graph is solved, so all of it is held; and the linearization points are the estimate.  They stay there, in one
@@ -77,6 +81,11 @@ def computed_square_root(graph: FactorGraph) -> SquareRoot:
         key, factors = int(graph.keys[tree.failed]), graph.factors_of(tree.failed)
         raise errors.Underconstrained(key, factors, "its covariance is infinite; add a prior or a factor")
     copy.values = values
+    if tree.raised:
+        count, order = int(copy.counts[at.VARIABLES]), np.empty(int(tree.state[tl.S_ALIVE]), np.int64)
+        order = order[: list_cliques(tree.node[:count], tree.clique, order)]
+        first = np.flatnonzero(is_first(copy.fac[: copy.counts[at.FACTORS]]))
+        replace_rows(copy, tree, order, variable_dims(copy.var[:count]), first)
     return _copied(copy, tree)
 
 
