@@ -49,13 +49,13 @@ def replace_rows(graph: FactorGraph, tree: CliqueTree, order: I64, dims: I64, fi
 
 def _triangle(variables: I64, dims: I64, rows: list[tuple[I64, F64]]) -> F64:
     """Upper triangular, with a positive diagonal: `rows` of some of the `variables` each, by their columns."""
-    start = np.cumsum(dims[variables]) - dims[variables]
+    start: I64 = np.cumsum(dims[variables]) - dims[variables]
     place = dict(zip(variables.tolist(), start.tolist(), strict=True))
     width = int(dims[variables].sum())
     stacked = np.zeros((max(sum(len(J) for _, J in rows), width), width))
     at_row = 0
     for ends, J in rows:
-        columns = np.concatenate([place[v] + np.arange(dims[v]) for v in ends.tolist()] or [np.empty(0, np.int64)])
+        columns = np.concatenate([place[v] + np.arange(int(dims[v])) for v in ends.tolist()] or [np.empty(0, np.int64)])
         stacked[at_row : at_row + len(J), columns] = J
         at_row += len(J)
     # The largest first: a transformation that begins with a small row would round what it takes from the others.
