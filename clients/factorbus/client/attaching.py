@@ -30,14 +30,14 @@ from factorbus.client.merging import (
     is_gauge,
     keys_named,
 )
-from factorbus.client.parts import adrift, keys_in_no_frame, pairs_named, split_by_letters
+from factorbus.client.parts import adrift, pairs_named, split_by_letters
 from factorbus.client.roles import Roles, roles_of
 from factorbus.client.transform_factors import transform_factors
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import name_of_kind
 from factorbus.proto.messages import Accepted, Batch, Factors, Variables
 from factorbus.proto.problems import Refused
-from factorbus.proto.roles import pick_factors, pick_variables
+from factorbus.proto.roles import keys_in_no_frame, pick_factors, pick_variables
 
 _ABSOLUTE = ("refuse", "leave_out")
 _TRIES = 3

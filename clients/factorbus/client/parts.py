@@ -8,11 +8,10 @@ import numpy as np
 
 from factorbus.client.arguments import of_type
 from factorbus.client.merging import CannotMerge
-from factorbus.client.roles import roles_of
 from factorbus.proto.arrays import I64
-from factorbus.proto.kinds import VARIABLE_KINDS, name_of_kind
+from factorbus.proto.kinds import name_of_kind
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.roles import mounts_of, pick_factors, pick_variables
+from factorbus.proto.roles import keys_in_no_frame, pick_factors, pick_variables
 from factorbus.proto.symbols import format_symbol, symbol
 
 _SHOWN = 3
@@ -40,12 +39,6 @@ def split_by_letters(graph: Batch, letters: str) -> tuple[Batch, tuple[Variables
     part = tuple(pick_variables(group, chosen) for group, chosen in groups if chosen.any())
     rest = tuple(pick_variables(group, ~chosen) for group, chosen in groups if not chosen.all())
     return Batch(part, tuple(factors)), rest
-
-
-def keys_in_no_frame(graph: Batch) -> I64:
-    """Mounts and plain numbers, which are the same in every frame, so that two parts may have them."""
-    vectors = [group.keys for group in graph.variables if VARIABLE_KINDS[group.kind].is_vector]
-    return np.setdiff1d(np.concatenate([mounts_of(graph), *vectors]), roles_of(graph).axes)
 
 
 def adrift(keys: I64, factors: Sequence[Factors], held: I64) -> I64:
