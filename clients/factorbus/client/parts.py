@@ -16,11 +16,16 @@ from factorbus.proto.symbols import format_symbol, symbol
 
 _SHOWN = 3
 _NONE = np.empty(0, np.int64)
+_JOINED = (
+    "the part is joined to the rest already, by {}; wanted a part that has no factor with the rest: keep candidates "
+    "out of the map, and give them to `attach`"
+)
 
 
-def split_by_letters(graph: Batch, letters: str) -> tuple[Batch, tuple[Variables, ...]]:
+def split_by_letters(graph: Batch, letters: str, joined: str = _JOINED) -> tuple[Batch, tuple[Variables, ...]]:
     """The part whose keys have these letters, and the variables of the rest.
 
+    joined: what is said where a factor is between them, which `{}` names.
     Raises CannotMerge (no part, no rest, a factor between them), BadSymbol, BadOption.
     """
     codes = _codes(letters)
@@ -32,7 +37,7 @@ def split_by_letters(graph: Batch, letters: str) -> tuple[Batch, tuple[Variables
         some = np.asarray((of_part & ~nowhere).any(axis=1))
         both = some & np.asarray((~of_part & ~nowhere).any(axis=1))
         if both.any():
-            raise _joined(group, both)
+            raise CannotMerge(joined.format(f"{name_of_kind(group.kind)} {pairs_named(group.keys[both])}"))
         if some.any():
             factors.append(pick_factors(group, some))
     groups = [(group, np.isin(group.keys >> 56, codes)) for group in graph.variables]
@@ -87,11 +92,3 @@ def _check_there(codes: list[int], names: I64) -> None:
             f"the map has no variable with other letters than {listed}; wanted the letters of a part, which is brought "
             "into the frame of the rest"
         )
-
-
-def _joined(group: Factors, which: np.ndarray) -> CannotMerge:
-    """The error that names some of the factors that join the part to the rest."""
-    return CannotMerge(
-        f"the part is joined to the rest already, by {name_of_kind(group.kind)} {pairs_named(group.keys[which])}; "
-        "wanted a part that has no factor with the rest: keep candidates out of the map, and give them to `attach`"
-    )
