@@ -52,6 +52,7 @@ def test_two_until_the_first_is_attached(endpoint: str) -> None:
         assert attach(hall, "y", candidates).accepted
         (one,) = hall.components().listed
         assert (dict(one.letters), dict(one.held)) == ({"x": 20, "y": 12}, {"fixed": 1})
+        assert "its own" not in command(endpoint, "ask", "components", "hall")
         assert "one component: all of it hangs together" in command(endpoint, "stats", "hall")
 
 

@@ -72,7 +72,7 @@ def components_line(found: Mapping[str, Any]) -> str:
 
 def _rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     count, listed = found["count"], found["components"]
-    rows = [("components", f"{count:,}"), *((_letters(each), _in_words(each)) for each in listed[:_SHOWN])]
+    rows = [("components", f"{count:,}"), *((_letters(each), _in_words(each, count > 1)) for each in listed[:_SHOWN])]
     if count > _SHOWN:
         rows.append(("", f"and {counted(count - _SHOWN, 'component')} more: --json lists the largest"))
     if aside := found["in_no_frame"]:
@@ -84,7 +84,7 @@ def _letters(each: Mapping[str, Any]) -> str:
     return " ".join(letter or "no letter" for letter in sorted(each["letters"]))
 
 
-def _in_words(each: Mapping[str, Any]) -> str:
+def _in_words(each: Mapping[str, Any], is_one_of_several: bool) -> str:
     size = f"{counted(each['variables'], 'variable')}, the first {each['first']}, {counted(each['factors'], 'factor')}"
     held = ", ".join(f"{count} {kind}" for kind, count in each["held"].items()) or "nothing"
-    return f"{size}; held by {held}" + (": in a frame of its own" if each["own_frame"] else "")
+    return f"{size}; held by {held}" + (": in a frame of its own" if each["own_frame"] and is_one_of_several else "")
