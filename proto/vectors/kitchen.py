@@ -17,6 +17,7 @@ import numpy as np
 from factorbus.proto import asking, codec
 from factorbus.proto import asking_codec as asked
 from factorbus.proto import repair_codec as repairs
+from factorbus.proto.components import encode_components
 from factorbus.proto.messages import (
     Accepted,
     Batch,
@@ -36,6 +37,7 @@ from factorbus.proto.problems import BetterOptimum
 from factorbus.proto.stamps import LEAST_STAMP, NO_STAMP
 from factorbus.proto.step_history import StepHistory, encode_step_history
 from factorbus.proto.symbols import symbol
+from factorbus.service.questions.components import components_of_map
 from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver import Options, Solver
 from factorbus.solver.changes.repair import repair
@@ -71,6 +73,7 @@ def messages() -> dict[str, bytes]:
         "estimate": codec.encode_estimate(Estimate(EPOCH, 3, graph.batch.variables)),
         "graph": codec.encode_graph(graph),
         "graph_ids": codec.encode_graph(_without_the_false_one()),
+        "components": encode_components(components_of_map(graph)),
         "history": _history(steps),
         "chi2": codec.encode_chi2(Chi2(EPOCH, 3, chi2)),
         "chi2_batch": codec.encode_chi2(Chi2(EPOCH, 3, chi2, optimum.chi2, "w1", _SECONDS)),

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorbus.proto import asking_codec as codec
-from factorbus.proto import closures, repair_codec
+from factorbus.proto import closures, components, repair_codec
 from factorbus.proto.asking import AskCovariance, Covariances
 from factorbus.proto.problems import BadMessage, Problem
 from factorbus.proto.symbols import symbol
@@ -35,6 +35,7 @@ CODECS: dict[str, tuple[Callable[[Any], bytes], Callable[[bytes], Any]]] = {
     "repaired": (repair_codec.encode_repaired, repair_codec.decode_repaired),
     "ask_suspects": (closures.encode_ask_suspects, closures.decode_ask_suspects),
     "suspects": (closures.encode_suspects, closures.decode_suspects),
+    "components": (components.encode_components, components.decode_components),
     "closure_entry": (closures.encode_closure_entry, closures.decode_closure_entry),
     "closure_entry_ahead": (closures.encode_closure_entry, closures.decode_closure_entry),
 }

@@ -14,7 +14,7 @@ from factorbus.proto.keep import keep_text
 from factorbus.proto.messages import Batch, Change, Insert, Variables
 from factorbus.proto.own_clients import KEEPER
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Arrived
+from factorbus.service.core.events import Arrived, MovedClosure, Verdict
 from factorbus.service.journal.library import made_as_of, make_map_solver
 from factorbus.service.journal.recovery import recover, verify
 from factorbus.service.journal.writing import written
@@ -35,6 +35,8 @@ class Kept:
         self.map_solver = make_map_solver("bayes-tree", self.options, EPOCH, Limits())
         self.store: Store = create(folder, "m", "bayes-tree", self.map_solver.options(), EPOCH, "none")
         self.removed = self.plans = self.number = 0
+        self.told: list[MovedClosure] = []  # by the last insert
+        self.gone: list[int] = []  # closures that went with a pose that the policy took out
 
     def insert(self, batch: Batch, changes: tuple[Change, ...] = ()) -> None:
         self.number += 1
@@ -44,6 +46,7 @@ class Kept:
 
     def apply(self, arrived: Arrived) -> None:
         events, _ = self.map_solver.apply_whole([arrived])
+        self.told = [moved for event in events if isinstance(event, Verdict) for moved in event.closures]
         last = self.store.last()
         record = written(last.record + 1, [arrived], events, last)
         assert all(entry.outcome == 0 for entry in record.entries if entry.client == KEEPER)
@@ -57,6 +60,7 @@ class Kept:
             self.removed += planned.poses
             self.plans += 1
             self.apply(inserts[0])
+            self.gone += [moved.factor for moved in self.told if (moved.state, moved.reason) == ("gone", "pose_gone")]
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +150,5 @@ def test_poses_of_closures_that_no_new_one_is_compared_with_and_of_rejected_ones
     assert [pair for pair in left if pair in suspects] == suspects
     assert COMPARED <= len(suspects) < COMPARED + 5
     assert len(left) < count - 30
+    after = decode_suspects(made.map_solver.suspects(True)).factors
+    assert sorted(made.gone) == np.setdiff1d(closures.factors, after).tolist(), "and that is told of each, once"

@@ -9,41 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from naive.dense_factors import pose_matrix
-from two_maps import SEEN, Candidate, Drive, two_drives
+from two_maps import SEEN, Drive
+from two_parts import SIGMAS, between_parts, drafted, drives, fill
 
 from factorbus.cli.output.exits import REFUSED
 from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, Map, attach, connect
-
-SIGMAS = SEEN["se2"].tolist()
-
-
-def drives(kind: str, seed: int, right: int, wrong: int, grouped: int = 0) -> tuple[Drive, Drive, list[Candidate]]:
-    return two_drives(kind, 60, (right, wrong), grouped, np.random.default_rng(seed))
-
-
-def drafted(kind: str, candidates: list[Candidate]) -> Draft:
-    draft = Draft()
-    for each in candidates:
-        draft.factor(f"between_{kind}", [f"x{each.a}", f"y{each.b}"], each.z, sigmas=SEEN[kind].tolist())
-    return draft
-
-
-def fill(into: Map, of: Drive, letter: str = "x") -> None:
-    for step in of.steps:
-        batch = step.batch()
-        names = {ord("x"): ord(letter)}
-        into.send(
-            batch._replace(
-                variables=tuple(g._replace(keys=renamed(g.keys, names)) for g in batch.variables),
-                factors=tuple(g._replace(keys=renamed(g.keys, names)) for g in batch.factors),
-            )
-        )
-    into.flush()
-
-
-def renamed(keys: np.ndarray, names: dict[int, int]) -> np.ndarray:
-    letters = np.array([names[letter] for letter in (keys >> 56).ravel().tolist()]).reshape(keys.shape)
-    return keys & (1 << 56) - 1 | letters << 56
 
 
 def how_far_off(hall: Map, one: Drive, other: Drive) -> float:
@@ -197,11 +167,6 @@ def test_what_marginalize_left_of_a_prior_goes_as_a_prior_does(endpoint: str) ->
     assert attached.keys() == merged.keys()
     for key, value in attached.items():
         np.testing.assert_allclose(value, merged[key], atol=1e-3)
-
-
-def between_parts(hall: Map) -> int:
-    """How many factors join two letters."""
-    return sum(int((np.ptp(g.keys >> 56, axis=1) > 0).sum()) for g in hall.graph().batch.factors)
 
 
 def test_of_two_that_attach_one_part_at_once_the_second_is_refused(endpoint: str) -> None:

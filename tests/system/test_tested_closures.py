@@ -137,6 +137,26 @@ def iter_until(events: "queue.SimpleQueue[dict[str, Any]]", factor: int, state: 
             return seen
 
 
+def test_a_suspect_that_goes_with_its_pose_is_told(services: Callable[..., Services], tmp_path: Path) -> None:
+    running = services(tmp_path / "journal", 'closures="test"')
+    endpoint = running.start()
+    session, events = events_of(endpoint, "yard")
+    with connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus, bus.map("yard") as joined:
+        joined.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
+        for n in range(1, 30):
+            joined.insert(Draft().se2(f"x{n}").between_se2(f"x{n - 1}", f"x{n}", (1, 0, 0), sigmas=(0.1, 0.1, 0.02)))
+        for n in (20, 25):
+            joined.insert(Draft().between_se2("x2", f"x{n}", (0, 5, 1), sigmas=(0.1, 0.1, 0.05)))
+        first, second = joined.suspects().factors.tolist()
+        joined.change(Changes().marginalize("x20"))
+        seen = iter_until(events, first, "gone")
+        assert (seen[-1]["factors"], seen[-1]["reasons"]) == ([first], ["pose_gone"])
+        joined.change(Changes().remove_factors([second]))
+        assert iter_until(events, second, "gone")[-1]["reasons"] == ["removed"]
+        assert joined.stats()["closure_states"]["suspect"] == joined.suspects().factors.size == 0
+    session.close()
+
+
 def test_killed_again_and_again_nothing_is_lost_or_done_twice(
     services: Callable[..., Services], tmp_path: Path, drive: DriveWithFalse
 ) -> None:

@@ -11,6 +11,7 @@ from factorbus.client.aligning import Alignment, AmbiguousAlignment, NotAligned,
 from factorbus.client.attaching import Attached, attach
 from factorbus.client.bus import Bus, connect
 from factorbus.client.changes import Changes
+from factorbus.client.detaching import undo_attach
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features, Growing
 from factorbus.client.filter_state import Factored, FilterState
@@ -71,4 +72,5 @@ __all__ = [
     "initial_from_standstill",
     "preintegrate_samples",
     "rename_kinds",
+    "undo_attach",
 ]

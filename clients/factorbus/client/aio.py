@@ -39,6 +39,7 @@ from factorbus.client.stream import DeltaStream
 from factorbus.proto.asking import Repaired
 from factorbus.proto.camera import Camera
 from factorbus.proto.closures import Suspects
+from factorbus.proto.components import Components
 from factorbus.proto.interest import Interest
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, MapGraph
 
@@ -275,6 +276,13 @@ class Map:
         Raises Refused, Unavailable.
         """
         return await asyncio.wrap_future(self._map.ask.suspects(every, timeout_s))
+
+    async def components(self, timeout_s: float | None = None) -> Components:
+        """Which parts of the map no factor joins, as in `factorbus.client.Map.components`.
+
+        Raises Refused, Unavailable.
+        """
+        return await asyncio.wrap_future(self._map.ask.components(timeout_s))
 
     async def graph(self, timeout_s: float | None = None) -> MapGraph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""

@@ -30,21 +30,35 @@ from factorbus.client.merging import (
     is_gauge,
     keys_named,
 )
-from factorbus.client.parts import adrift, keys_in_no_frame, pairs_named, split_by_letters
+from factorbus.client.parts import adrift, pairs_named, split_by_letters
 from factorbus.client.roles import Roles, roles_of
 from factorbus.client.transform_factors import transform_factors
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import name_of_kind
 from factorbus.proto.messages import Accepted, Batch, Factors, Variables
 from factorbus.proto.problems import Refused
-from factorbus.proto.roles import pick_factors, pick_variables
+from factorbus.proto.roles import keys_in_no_frame, pick_factors, pick_variables
 
 _ABSOLUTE = ("refuse", "leave_out")
 _TRIES = 3
+_NONE = np.empty(0, np.int64)
 _WORDS = (
     "the part says where it is in its own frame more than once ({}), which is wrong in that of the rest; "
     'nothing was attached. absolute="leave_out" attaches it without them'
 )
+
+
+@dataclass(frozen=True, slots=True)
+class AttachedPart:
+    """A part as it was before it was attached, for `undo_attach`.
+
+    letters: of its keys.  anchors (n,): ids of the candidates that hold it.  held: the variables that were fixed, where
+    they were, and the factors that are gone.
+    """
+
+    letters: str
+    anchors: I64
+    held: Batch
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +67,13 @@ class Attached:
 
     accepted: the answer to the insert that attached it; None: the candidates do not say where it is yet, or say two
     things (`alignment.verdict`), and nothing has changed.  left_out: how many of each kind of what held it are gone
-    ("fixed": variables that are now estimated).
+    ("fixed": variables that are now estimated).  part: what `undo_attach` puts back.
     """
 
     alignment: Alignment
     accepted: Accepted | None = None
     left_out: Mapping[str, int] = field(default_factory=dict)
+    part: AttachedPart | None = field(default=None, repr=False)
 
 
 def attach(
@@ -107,7 +122,7 @@ def _attach(here: Map, letters: str, given: Batch, absolute: str, settle: bool, 
     # 2. What holds it in its own frame.
     roles = roles_of(graph)
     alone = [(group, ~hold_in_any_frame(group, roles)) for group in part.factors]
-    held = _held(part, alone)
+    held = what_holds(part, alone)
     if absolute == "refuse" and not is_gauge(part, held):
         raise AbsoluteFactors(held, _WORDS)
     # 3. Where it lies.
@@ -121,10 +136,17 @@ def _attach(here: Map, letters: str, given: Batch, absolute: str, settle: bool, 
     if here.closures == "test":
         _check_not_tested(here, anchors, timeout_s)
     # 4. One insert.
-    changes, turned = _changes(part, alone, roles, found.frame)
+    changes, turned = changes_of_frame(part, alone, roles, found.frame)
     batch = Batch((), (*turned, *anchors.factors))
     sent = as_trusted(batch) if here.closures == "test" else batch
-    return Attached(found, here.insert(sent, changes=changes, settle=settle, timeout_s=timeout_s), held)
+    accepted = here.insert(sent, changes=changes, settle=settle, timeout_s=timeout_s)
+    # 5. What would take it back.
+    ids = accepted.first_factor + np.arange(Batch((), tuple(turned)).factor_count, batch.factor_count)
+    gauge = Batch(
+        tuple(group for group in moving_variables(part) if group.fixed),
+        tuple(pick_factors(group, which) for group, which in alone if which.any()),
+    )
+    return Attached(found, accepted, held, AttachedPart(letters, ids, gauge))
 
 
 def _places(group: Variables, roles: Roles) -> Variables:
@@ -153,7 +175,7 @@ def _check_candidates(given: Batch, kind: str, rest: Sequence[Variables], part: 
 
 def _check_held(part: Batch, alone: Sequence[tuple[Factors, np.ndarray]], anchors: Batch) -> None:
     """All of the part hangs on a candidate that agrees: else it would go to a place that nobody measured."""
-    keys = np.concatenate([np.empty(0, np.int64), *(group.keys for group in _moving(part))])
+    keys = np.concatenate([np.empty(0, np.int64), *(group.keys for group in moving_variables(part))])
     ends = np.concatenate([group.keys.ravel() for group in anchors.factors])
     lost = adrift(keys, [pick_factors(group, ~which) for group, which in alone], ends)
     if lost.size:
@@ -178,16 +200,16 @@ def _check_not_tested(here: Map, anchors: Batch, timeout_s: float | None) -> Non
         )
 
 
-def _moving(part: Batch) -> list[Variables]:
+def moving_variables(part: Batch) -> list[Variables]:
     """All but mounts and plain numbers, which are the same in every frame."""
     aside = keys_in_no_frame(part)
     groups = [(group, ~np.isin(group.keys, aside)) for group in part.variables]
     return [pick_variables(group, chosen) for group, chosen in groups if chosen.any()]
 
 
-def _held(part: Batch, alone: Sequence[tuple[Factors, np.ndarray]]) -> dict[str, int]:
+def what_holds(part: Batch, alone: Sequence[tuple[Factors, np.ndarray]]) -> dict[str, int]:
     """How many of each kind hold the part in its own frame."""
-    fixed = sum(group.keys.size for group in _moving(part) if group.fixed)
+    fixed = sum(group.keys.size for group in moving_variables(part) if group.fixed)
     held = {"fixed": fixed} if fixed else {}
     for group, which in alone:
         if which.any():
@@ -196,11 +218,14 @@ def _held(part: Batch, alone: Sequence[tuple[Factors, np.ndarray]]) -> dict[str,
     return held
 
 
-def _changes(
-    part: Batch, alone: Sequence[tuple[Factors, np.ndarray]], roles: Roles, T: F64
+def changes_of_frame(
+    part: Batch, alone: Sequence[tuple[Factors, np.ndarray]], roles: Roles, T: F64, also: I64 = _NONE
 ) -> tuple[Changes, list[Factors]]:
-    """What brings the part to where it lies, and factors of it that have other numbers there."""
-    gone, turned = list[I64](), list[Factors]()
+    """What brings the part to where it lies, T_a_b, and factors of it that have other numbers there.
+
+    alone: of each group of its factors which go, as they hold it alone.  also (n,): ids of what goes, too.
+    """
+    gone, turned = [also], list[Factors]()
     for group, which in alone:
         gone.append(_ids(group)[which])
         if which.all():
@@ -216,7 +241,7 @@ def _changes(
     changes = Changes()
     if (ids := np.concatenate([np.empty(0, np.int64), *gone])).size:
         changes.remove_factors(ids.tolist())
-    places = _moving(part)
+    places = moving_variables(part)
     if fixed := [key for group in places if group.fixed for key in group.keys.tolist()]:
         changes.free(*fixed)
     changes.place([g._replace(values=roles.moved(g.kind, g.keys, _values(g), T)) for g in places], carry=True)

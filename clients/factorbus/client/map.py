@@ -26,12 +26,13 @@ from factorbus.client.questions import Questions, logged
 from factorbus.client.renaming_kinds import saying_how_to_rename
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.client.smoothed_poses import BlendedPose, SmoothedPoses
-from factorbus.client.supported import check_batch, check_changes, check_interest, check_suspects
+from factorbus.client.supported import check_batch, check_changes, check_components, check_interest, check_suspects
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
 from factorbus.proto.closures import Suspects
+from factorbus.proto.components import Components
 from factorbus.proto.interest import Interest
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Insert, MapGraph
 from factorbus.proto.problems import ClosedHere, NoMirror, Problem, Refused, Unavailable
@@ -51,13 +52,7 @@ class Map:
     """
 
     def __init__(
-        self,
-        link: Link,
-        sender: RequestSender,
-        client: str,
-        timeout_s: float,
-        window: int,
-        join: Callable[[], MapRow],
+        self, link: Link, sender: RequestSender, client: str, timeout_s: float, window: int, join: Callable[[], MapRow]
     ) -> None:
         self._link, self._sender, self._client, self.timeout_s = link, sender, client, timeout_s
         self._size, self._join = window, join
@@ -280,6 +275,14 @@ class Map:
         check_suspects(self._protocol)
         return self.ask.suspects(every, timeout_s).result()
 
+    def components(self, timeout_s: float | None = None) -> Components:
+        """Which parts of the map no factor joins, such as a robot's that is not attached yet, and what holds each.
+
+        Raises Refused, Unavailable, NotSupported.
+        """
+        check_components(self._protocol)
+        return self.ask.components(timeout_s).result()
+
     def graph(self, timeout_s: float | None = None) -> MapGraph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""
         return self.ask.graph(timeout_s).result()
@@ -293,13 +296,9 @@ class Map:
         return present_clients(self._link, self.name, checked_seconds("timeout_s", timeout_s, self.timeout_s))
 
     def export(
-        self,
-        format: str = "g2o",
-        timeout_s: float | None = None,
-        robot: str | None = None,
-        strict: bool = False,
+        self, format: str = "g2o", timeout_s: float | None = None, robot: str | None = None, strict: bool = False,
         ids: str = "auto",
-    ) -> str:
+    ) -> str:  # fmt: skip
         """The map as the text of a file: "g2o", "pyfg", "jrl", "tum" or "kitti".
 
         robot: the letter of the robot whose trajectory it is ("" for keys without one), if the map has several.  What

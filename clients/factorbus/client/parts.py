@@ -8,20 +8,24 @@ import numpy as np
 
 from factorbus.client.arguments import of_type
 from factorbus.client.merging import CannotMerge
-from factorbus.client.roles import roles_of
 from factorbus.proto.arrays import I64
-from factorbus.proto.kinds import VARIABLE_KINDS, name_of_kind
+from factorbus.proto.kinds import name_of_kind
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.roles import mounts_of, pick_factors, pick_variables
+from factorbus.proto.roles import keys_in_no_frame, pick_factors, pick_variables
 from factorbus.proto.symbols import format_symbol, symbol
 
 _SHOWN = 3
 _NONE = np.empty(0, np.int64)
+_JOINED = (
+    "the part is joined to the rest already, by {}; wanted a part that has no factor with the rest: keep candidates "
+    "out of the map, and give them to `attach`"
+)
 
 
-def split_by_letters(graph: Batch, letters: str) -> tuple[Batch, tuple[Variables, ...]]:
+def split_by_letters(graph: Batch, letters: str, joined: str = _JOINED) -> tuple[Batch, tuple[Variables, ...]]:
     """The part whose keys have these letters, and the variables of the rest.
 
+    joined: what is said where a factor is between them, which `{}` names.
     Raises CannotMerge (no part, no rest, a factor between them), BadSymbol, BadOption.
     """
     codes = _codes(letters)
@@ -33,19 +37,13 @@ def split_by_letters(graph: Batch, letters: str) -> tuple[Batch, tuple[Variables
         some = np.asarray((of_part & ~nowhere).any(axis=1))
         both = some & np.asarray((~of_part & ~nowhere).any(axis=1))
         if both.any():
-            raise _joined(group, both)
+            raise CannotMerge(joined.format(f"{name_of_kind(group.kind)} {pairs_named(group.keys[both])}"))
         if some.any():
             factors.append(pick_factors(group, some))
     groups = [(group, np.isin(group.keys >> 56, codes)) for group in graph.variables]
     part = tuple(pick_variables(group, chosen) for group, chosen in groups if chosen.any())
     rest = tuple(pick_variables(group, ~chosen) for group, chosen in groups if not chosen.all())
     return Batch(part, tuple(factors)), rest
-
-
-def keys_in_no_frame(graph: Batch) -> I64:
-    """Mounts and plain numbers, which are the same in every frame, so that two parts may have them."""
-    vectors = [group.keys for group in graph.variables if VARIABLE_KINDS[group.kind].is_vector]
-    return np.setdiff1d(np.concatenate([mounts_of(graph), *vectors]), roles_of(graph).axes)
 
 
 def adrift(keys: I64, factors: Sequence[Factors], held: I64) -> I64:
@@ -94,11 +92,3 @@ def _check_there(codes: list[int], names: I64) -> None:
             f"the map has no variable with other letters than {listed}; wanted the letters of a part, which is brought "
             "into the frame of the rest"
         )
-
-
-def _joined(group: Factors, which: np.ndarray) -> CannotMerge:
-    """The error that names some of the factors that join the part to the rest."""
-    return CannotMerge(
-        f"the part is joined to the rest already, by {name_of_kind(group.kind)} {pairs_named(group.keys[which])}; "
-        "wanted a part that has no factor with the rest: keep candidates out of the map, and give them to `attach`"
-    )

@@ -11,6 +11,7 @@ from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.closures import AskSuspects, Suspects, decode_suspects, encode_ask_suspects
+from factorbus.proto.components import Components, decode_components
 from factorbus.proto.interest import Interest, checked_interest
 from factorbus.proto.interest_codec import filter_map
 from factorbus.proto.messages import Chi2, Estimate, MapGraph
@@ -89,6 +90,10 @@ class Questions:
         """Loop closures that the estimate does not have, or all of them."""
         question = encode_ask_suspects(AskSuspects(checked_flag("every", every)))
         return self._ask("suspects", question, decode_suspects, timeout_s)
+
+    def components(self, timeout_s: float | None) -> Future[Components]:
+        """Which parts of the map no factor joins."""
+        return self._ask("components", codec.encode_map({}), decode_components, timeout_s)
 
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
         what = f"map {self._map!r}, asked for its {question},"

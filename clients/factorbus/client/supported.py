@@ -43,6 +43,12 @@ def check_suspects(protocol: Mapping[str, Any]) -> None:
         raise NotSupported("a map that tests its loop closures", str(protocol.get("product", "")))
 
 
+def check_components(protocol: Mapping[str, Any]) -> None:
+    """Raises NotSupported where a service with this protocol does not tell them."""
+    if protocol and "components" not in protocol.get("questions", ()):
+        raise NotSupported("which parts of a map nothing joins", str(protocol.get("product", "")))
+
+
 def check_interest(protocol: Mapping[str, Any]) -> None:
     """Raises NotSupported where a service with this protocol knows of no interests."""
     if protocol and "interest" not in protocol.get("questions", ()):

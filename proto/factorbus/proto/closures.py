@@ -21,6 +21,8 @@ CLOSURE_POLICIES = ("trust", "test")
 CLOSURE_STATES = ("accepted", "suspect", "rejected", "restored")
 # Why a state is what it is.
 CLOSURE_REASONS = ("new", "passed", "agrees", "unsure", "improbable", "rival", "contradicted", "failed", "user")
+# What the event `closures` says of one that the map has no more, and why: a change named it, or a pose of it went.
+GONE, REMOVED, POSE_GONE = "gone", "removed", "pose_gone"
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ PREFIX = f"factorbus/{VERSION}"
 ANY_SERVICE_OF_ANY_VERSION = "factorbus/*/features/*/live"
 QUESTIONS = (
     "estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why", "repair",
-    "interest", "records", "suspects", "history",
+    "interest", "records", "suspects", "history", "components",
 )  # fmt: skip
 LONGEST_NAME = 64
 _NAME = re.compile(r"[A-Za-z0-9_-]+")

@@ -6,7 +6,7 @@ The factors tell: `FactorKind.each_role` has what each of their variables is.
 import numpy as np
 
 from factorbus.proto.arrays import I64
-from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 
 MOUNT, FRAME, AXES = "mount", "frame", "axes"
@@ -20,6 +20,12 @@ def mounts_of(batch: Batch) -> I64:
 def poses_aside(batch: Batch) -> I64:
     """The keys of the poses that are no places in the map: mounts, and the map's poses in other frames."""
     return keys_of_role(batch, MOUNT, FRAME)
+
+
+def keys_in_no_frame(graph: Batch) -> I64:
+    """Mounts and plain numbers, which are the same in every frame, so that two parts of a map may have them."""
+    vectors = [group.keys for group in graph.variables if VARIABLE_KINDS[group.kind].is_vector]
+    return np.setdiff1d(np.concatenate([mounts_of(graph), *vectors]), keys_of_role(graph, AXES))
 
 
 def keys_of_role(batch: Batch, *roles: str) -> I64:

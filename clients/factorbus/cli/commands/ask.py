@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
+from factorbus.cli.commands.components import components_command
 from factorbus.cli.commands.suspects import suspects_command
 from factorbus.cli.output.advice import advising, of_what_is_there
 from factorbus.cli.output.console import document, table
@@ -323,6 +324,7 @@ def repair_command(
 
 
 command.add_command(suspects_command, "suspects")
+command.add_command(components_command, "components")
 
 
 def _variable_rows(explained: Any) -> list[tuple[str, str]]:

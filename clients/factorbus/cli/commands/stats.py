@@ -1,14 +1,18 @@
 """`factorbus stats`: what services count and time, asked over the bus."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from factorbus.cli.commands.components import components_document, components_line
 from factorbus.cli.output.exits import FAILED, OK
 from factorbus.cli.process.options import connect_option, json_option, timeout_option, zenoh_option
 from factorbus.proto.problems import UnknownMap
 from factorbus.wording import counted
+
+if TYPE_CHECKING:
+    from factorbus.client import Bus
 
 
 @click.command()
@@ -21,6 +25,7 @@ def command(name: str | None, endpoint: str, zenoh: str, timeout_s: float, as_js
     """Show how services are, what their maps hold, and how long steps and inserts take; with MAP, of that map alone.
 
     The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
+    Of one map it also says which parts of it no factor joins, which `factorbus ask components` has in full.
     At a router every service answers. Where access control is on, ask as an operator. The exit code is 1 when a
     service says that it is not alive: one of its threads is stuck.
 
@@ -34,8 +39,9 @@ def command(name: str | None, endpoint: str, zenoh: str, timeout_s: float, as_js
 
     with open_bus(endpoint, "stats", zenoh, timeout_s) as bus:
         services = sorted(bus.stats(), key=lambda each: str(each.get("service")))
-    if name is not None:
-        services = _of_map(services, name)
+        if name is not None:
+            services = _of_map(services, name)
+            _ask_components(bus, name, services)
     if as_json:
         screen.document({"services": services})
     else:
@@ -56,6 +62,19 @@ def _of_map(services: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
         rows = [row for each in services for row in (*each["maps"], *each.get("unopened", ()))]
         raise UnknownMap(name, sorted(row["name"] for row in rows))
     return found
+
+
+def _ask_components(bus: "Bus", name: str, services: list[dict[str, Any]]) -> None:
+    """Put which parts of map `name` nothing joins into its row; where no answer comes, all else is shown."""
+    from factorbus.proto.problems import Problem
+
+    try:
+        with bus.map(name, mirror=False, create=False) as joined:
+            found = components_document(joined.components())
+    except Problem:
+        return
+    for row in (row for each in services for row in each["maps"]):
+        row["components"] = found
 
 
 def _rows(service: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -99,6 +118,7 @@ def _map(row: Mapping[str, Any]) -> str:
         *([budget_line(row["budget"])] if "budget" in row else []),
         *([_closures(row["closure_states"])] if "closure_states" in row else []),
         *([_kept(row)] if "kept" in row else []),
+        *([components_line(row["components"])] if "components" in row else []),
         *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
         *(f"journal {name}: {value}" for name, value in shown_fields(row.get("journal", {}))),
     ]

@@ -90,7 +90,7 @@ def refusal(insert: Arrived, problem: Exception) -> Outcome:
 
 
 class MovedClosure(NamedTuple):
-    """A loop closure that is tested has another state, or is new and not believed; why."""
+    """A loop closure that is tested has another state, is new and not believed, or is gone; why."""
 
     factor: int
     state: str

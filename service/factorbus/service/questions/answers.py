@@ -15,6 +15,7 @@ from factorbus.proto import codec, fields
 from factorbus.proto.arrays import I64
 from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.closures import decode_ask_suspects
+from factorbus.proto.components import encode_components
 from factorbus.proto.interest import InterestFilter
 from factorbus.proto.interest_codec import decode_ask_interest, read_filter
 from factorbus.proto.keys import QUESTIONS
@@ -23,6 +24,7 @@ from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, MapGraph, V
 from factorbus.proto.problems import BadOption, Problem, UnknownQuestion, without_frames
 from factorbus.proto.repair_codec import decode_ask_repair, encode_repaired
 from factorbus.proto.stamps import NO_STAMP
+from factorbus.service.questions.components import components_of_map
 from factorbus.service.questions.question_memory import COPIES, Room
 from factorbus.service.questions.uncertainty import DECODE, MissingVariables, Uncertain, check_keys, near_variables
 from factorbus.solver.changes.repair import repair
@@ -158,7 +160,7 @@ def snapshot(
     ready = _refused(solver, questions, uncertain is not None, room)
     questions = [question for question in questions if id(question) not in ready]
     names = {question.name for question in questions}
-    whole = bool(names & {"graph", "export"}) or any(q.batch for q in questions)
+    whole = bool(names & {"graph", "export", "components"}) or any(q.batch for q in questions)
     variables, factors = solver.graph() if whole else ((), ())
     if not whole and names & {"estimate", "snapshot", "interest"}:
         variables = solver.estimate()
@@ -191,7 +193,7 @@ def _refused(solver: Any, questions: Sequence[Question], has_copy: bool, room: R
 def _check(solver: Any, question: Question, has_copy: bool, room: Room) -> None:
     """Is there room for what `question` needs copied, and for its answer?  Raises TooLarge, OutOfMemory."""
     name = question.name
-    if name in ("estimate", "graph", "export", "interest") or question.batch:
+    if name in ("estimate", "graph", "export", "interest", "components") or question.batch:
         variables, factors = solver.columns_bytes()
         size = variables if name in ("estimate", "interest") else variables + factors
         if name == "graph" or (name == "estimate" and question.keys is None and question.part is None):
@@ -225,7 +227,9 @@ def answer(question: Question, taken: QuestionCopies) -> bytes:
 
 def is_computed(question: Question, taken: QuestionCopies) -> bool:
     """Whether there is more to do for the answer than to put together what `taken` has."""
-    return id(question) not in taken.ready and (question.name in DECODE or question.name in ("repair", "export"))
+    return id(question) not in taken.ready and (
+        question.name in DECODE or question.name in ("repair", "export", "components")
+    )
 
 
 def check_ready(question: Question, taken: QuestionCopies) -> None:
@@ -249,6 +253,8 @@ def _answer(question: Question, taken: QuestionCopies) -> bytes:
         return codec.encode_chi2(Chi2(taken.epoch, taken.revision, taken.chi2))
     if question.name == "graph":
         return codec.encode_graph(taken.graph)
+    if question.name == "components":
+        return encode_components(components_of_map(taken.graph))
     text, notes = _text(question, taken.graph.batch)
     told = {"epoch": taken.epoch, "revision": taken.revision, "format": question.format}
     return codec.encode_map({**told, "text": text, "notes": notes})

@@ -41,6 +41,7 @@ from factorbus.service.core.events import (
 from factorbus.service.kernels.digest import digest
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.asked import AskedChanges, asked_changes
+from factorbus.service.solving.closure_news import forget_gone, moved_closures
 from factorbus.solver.closures.ahead import StagedBatch, enter_closures, stage_with_believed
 from factorbus.solver.closures.judging import COMPARED, ClosureJudge
 from factorbus.solver.closures.ledger import NEW, NO_VERDICTS, SUSPECT, Closure, ClosureLedger, ClosureVerdicts
@@ -216,7 +217,7 @@ class TestedMapSolver(MapSolver):
         elif staged is not None:
             new = enter_closures(self._solver, self._ledger, staged, self._revision)
         if entry is not None:
-            went_in, moved = isinstance(failed, bytes), _moved(c for c in new if c.is_in)
+            went_in, moved = isinstance(failed, bytes), moved_closures(c for c in new if c.is_in)
             behind.append(self._entered(entry, moved) if went_in else Verdict((refusal(entry, failed),)))
         if new:
             is_settled = staged is not None and staged.all_in and self._judge.is_settled(self._ledger)
@@ -297,7 +298,7 @@ class TestedMapSolver(MapSolver):
             return False
         if not (switch.out or switch.into):
             changed = self._ledger.note(verdicts, self._revision)
-            yield self._entered(insert, _moved(changed))
+            yield self._entered(insert, moved_closures(changed))
             return True
         changes = tuple(Change("remove_factors", removal.factors) for removal in switch.removals)
         batch = Batch((), tuple(switch.additions))  # pyright: ignore[reportArgumentType]
@@ -331,7 +332,7 @@ class TestedMapSolver(MapSolver):
             if done:
                 following, graph = outcome.first_factor + added, self._solver.factor_graph
                 changed = note_switch(graph, self._ledger, asked.said, asked.switch, following, self._revision)
-            yield event._replace(outcomes=(outcome,), closures=_moved(changed))
+            yield event._replace(outcomes=(outcome,), closures=moved_closures(changed))
         return done
 
     # ---- what a user says -------------------------------------------------------------------------------------------
@@ -347,11 +348,10 @@ class TestedMapSolver(MapSolver):
             return
         graph, names = self._solver.factor_graph, {change.change for change in content.changes}
         if names & _CUTTING or asked.gone:
-            here = [c for c in self._ledger.closures if c.factor_id not in asked.gone]
-            rows = graph.rows_of(np.array([c.factor_id for c in here], np.int64))
-            lost = [c for c, row in zip(here, rows.tolist(), strict=True) if not _stands(c, row, graph)]
-            self._ledger.forget(asked.gone | {c.factor_id for c in lost}, graph)
+            gone = forget_gone(self._ledger, graph, asked.gone, content.changes)
             self._forest.renew(graph)
+            if gone:  # behind the delta of the step that took them along
+                yield Verdict((), self._revision, closures=gone)
         else:
             self._forest.join(content.batch)
         for change in content.changes:
@@ -389,12 +389,3 @@ def _batch_of(insert: Arrived) -> Batch | None:
     if isinstance(content, ParsedInsert):
         return codec.decode_insert(content.message, ANSWER_LIMITS).batch
     return content.batch if isinstance(content, Insert) else None
-
-
-def _stands(closure: Closure, row: int, graph: Any) -> bool:
-    """Whether a closure is still one: in the map, or out and between poses that are there."""
-    return row >= 0 if closure.is_in else all(graph.find(key) >= 0 for key in closure.keys)
-
-
-def _moved(changed: Iterable[Closure]) -> tuple[MovedClosure, ...]:
-    return tuple(MovedClosure(c.factor_id, c.state, c.reason) for c in changed)
