@@ -32,11 +32,11 @@ def goes_on(weighted_error: float, settings: F64, state: I64, totals: F64) -> bo
 
     weighted_error: as `measure` gives it
     """
-    rounds, goes_on_slowly = state[tl.S_ROUNDS], state[tl.S_CONTINUES] != 0 or state[tl.S_SLOW] != 0
+    rounds, continues = state[tl.S_ROUNDS], state[tl.S_CONTINUES] != 0
     if state[tl.S_ONCE] != 0:
         return False
     if left(totals) > allowed(settings, state, totals):
-        return rounds < (settings[tl.P_MAX_ROUNDS] if goes_on_slowly else MOST_ROUNDS)
+        return rounds < (settings[tl.P_MAX_ROUNDS] if continues else MOST_ROUNDS)
     return (
         state[tl.S_CONTINUES] == 0
         and weighted_error > settings[tl.P_SAME_STEP_SHARE]
