@@ -9,7 +9,7 @@ import argparse
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -225,27 +225,37 @@ class _Words:
 
 def write(path: Path, drive: FullDrive) -> Path:
     """By the ending of the path, which must not be there yet."""
+    return write_robots(path, {"": drive})
+
+
+def write_robots(path: Path, drives: Mapping[str, FullDrive]) -> Path:
+    """The same of several robots, whose topics begin with their names: "/one"."""
     if path.exists():
         raise FileExistsError(f"{path} is there already")
     if path.suffix == ".bag":
         with Bag1Writer(path) as bag:
-            _fill(bag, _Words(ros1=True), drive)
+            _fill(bag, _Words(ros1=True), drives)
     elif path.suffix == ".mcap":  # the one of a folder
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             with Bag2Writer(Path(folder) / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-                _fill(writer, _Words(ros1=False), drive)
+                _fill(writer, _Words(ros1=False), drives)
             (file,) = (Path(folder) / "bag").glob("*.mcap")
             shutil.move(file, path)
     else:
         with Bag2Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-            _fill(writer, _Words(ros1=False), drive)
+            _fill(writer, _Words(ros1=False), drives)
     return path
 
 
-def _fill(writer: Any, words: _Words, drive: FullDrive) -> None:
-    topics = {name: writer.add_connection(name, kind, typestore=words.store) for name, kind in _TYPES.items()}
-    for topic, ns, message in words.said(drive):
-        writer.write(topics[topic], ns, words.serialize(topic, message))
+def _fill(writer: Any, words: _Words, drives: Mapping[str, FullDrive]) -> None:
+    topics = {
+        robot + name: writer.add_connection(robot + name, kind, typestore=words.store)
+        for robot in drives
+        for name, kind in _TYPES.items()
+    }
+    said = [(ns, robot, topic, message) for robot, drive in drives.items() for topic, ns, message in words.said(drive)]
+    for ns, robot, topic, message in sorted(said, key=lambda each: each[0]):
+        writer.write(topics[robot + topic], ns, words.serialize(topic, message))
 
 
 if __name__ == "__main__":

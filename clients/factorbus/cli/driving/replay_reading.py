@@ -7,9 +7,8 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from factorbus.cli.driving.replay_source import is_recording
 from factorbus.cli.output.exits import require
-from factorbus.cli.process.reading import read_drive, say
+from factorbus.cli.process.reading import is_recording, read_drive, say
 from factorbus.ros2.options import RobotOptions
 
 # What is given one by one, and collected under the name of several.
