@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin
 from test_recordings import FOUND, bits, run, same
 
 from factorbus.cli.main import main
-from factorbus.cli.output.exits import BAD_FILE, OK
+from factorbus.cli.output.exits import BAD_FILE, OK, USAGE
 from factorbus.ros2.options import RobotOptions
 from factorbus.ros2.problems import BadRecording, BadRosName
 from factorbus.ros2.recorded_drive import read_recording
@@ -174,3 +174,36 @@ def test_the_frame_of_gnss_is_no_pose_of_what_is_solved(path: Path, capsys: pyte
     poses = read_recording(path, FOUND).steps.poses
     assert main(["solve", str(path)]) == OK
     assert f"{poses} poses" in capsys.readouterr().out
+
+
+PARAMETERS = """
+/**:
+  ros__parameters:
+    odom: /odom
+    keyframe: [2, 1]
+    fix: [none]
+    use_sim_time: true
+    smooth_s: 2.0  # from here on the bridge's alone
+    domain: 3
+    map: hall
+    connect: tcp/127.0.0.1:1
+"""
+
+
+def test_the_parameters_of_the_robots_bridge_are_read(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (file := tmp_path / "robot.yaml").write_text(PARAMETERS)
+    code, document, _ = run(capsys, path, "--in-process", "--params-file", file)
+    asked = replace(OPTIONS, odom="/odom", fixes=("none",), keyframe=(2.0, 1.0))
+    assert (code, document["poses"]) == (OK, read_recording(path, robot_settings(asked)).steps.poses)
+    assert document["read"]["used"].keys() == {ODOM, GRAPH}
+    code, document, _ = run(capsys, path, "--in-process", "--params-file", file, "--keyframe", "0.5", "0.35")
+    assert document["poses"] == read_recording(path, FOUND).steps.poses
+    delivered = Path(__file__).parents[2] / "deploy" / "ros2" / "robot.yaml"
+    assert run(capsys, path, "--in-process", "--params-file", delivered)[1]["poses"] == document["poses"]
+    (tmp_path / "graph.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    assert main(["replay", str(tmp_path / "graph.g2o"), "--in-process", "--params-file", str(file)]) == USAGE
+    assert "--params-file is of recordings" in capsys.readouterr().err
+    file.write_text(PARAMETERS.replace("smooth_s", "smoth_s"))
+    assert run(capsys, path, "--in-process", "--params-file", file)[0] == BAD_FILE

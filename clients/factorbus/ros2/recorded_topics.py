@@ -142,7 +142,8 @@ def _check_named(recording: RobotRecording, type_name: str, name: str) -> None:
     """Raises BadRecording: a topic that was named is not there, or has messages of another type."""
     topics = {topic.name: topic for topic in recording.topics}
     if name not in topics:
-        raise BadRecording(recording.path, f"no topic {name}", f"one of {_listed(recording.topics)}")
+        instead = "" if type_name in (ODOMETRY, IMU) else ", or none"
+        raise BadRecording(recording.path, f"no topic {name}", f"one of {_listed(recording.topics)}{instead}")
     if _type_of(topics[name]) != type_name:
         there = _listed(_of_type(recording, type_name)) or "none"
         wanted = f"a topic of {type_name} (there is {there})"

@@ -21,7 +21,10 @@ _ONCE = {
 def check_kind(file: Path) -> None:
     """Raises UsageError: an option is of recordings, or of graph files, and FILE is the other."""
     given = click.get_current_context().get_parameter_source
-    of_graphs, of_recordings = ("use_values", "dialect"), ("rate", *(each.name for each in fields(RobotOptions)))
+    of_graphs, of_recordings = (
+        ("use_values", "dialect"),
+        ("rate", "params_file", *(each.name for each in fields(RobotOptions))),
+    )
     recorded = is_recording(file)
     for name in of_graphs if recorded else of_recordings:
         if given(name) is ParameterSource.COMMANDLINE:
