@@ -37,7 +37,7 @@ _SAMPLES_EACH, _NODES_EACH = 20, 5  # samples for each odometry, odometries for 
 _LEAST_AGO_S, _NEAR_M = 30.0, 4.0  # of a place that is seen again
 
 TF, ODOM, FIX, IMU, GRAPH = "/tf_static", "/odom", "/gps/fix", "/imu/data_raw", "/kimera/pose_graph"
-_TYPES = {
+TYPES = {
     TF: "tf2_msgs/msg/TFMessage",
     ODOM: "nav_msgs/msg/Odometry",
     FIX: "sensor_msgs/msg/NavSatFix",
@@ -52,7 +52,7 @@ _DEFINED = {
         "std_msgs/Header header\nuint64 key_from\nuint64 key_to\nint32 robot_from\nint32 robot_to\nint32 type\n"
         "geometry_msgs/Pose pose\nfloat64[36] covariance\n"
     ),
-    _TYPES[GRAPH]: (
+    TYPES[GRAPH]: (
         "std_msgs/Header header\npose_graph_tools_msgs/PoseGraphNode[] nodes\n"
         "pose_graph_tools_msgs/PoseGraphEdge[] edges\n"
     ),
@@ -136,7 +136,7 @@ def at(seconds: float) -> int:
     return START_NS + round(seconds * 1e9)
 
 
-class _Words:
+class RosWords:
     """Messages of one generation of ROS; said (topic, when, message), in the order in which they are heard."""
 
     def __init__(self, ros1: bool) -> None:
@@ -144,7 +144,7 @@ class _Words:
         for name, text in _DEFINED.items():
             self.store.register(get_types_from_msg(text, name))
         if ros1:
-            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TYPES[TF]))
+            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TYPES[TF]))
         known = {name.split("/")[-1]: kind for name, kind in self.store.types.items()}
         known["Time"] = self.store.types["builtin_interfaces/msg/Time"]  # std_msgs of ROS 1 has one, too
         self._ros1, self._types = ros1, known
@@ -152,7 +152,7 @@ class _Words:
     def serialize(self, topic: str, message: Any) -> bytes:
         """As the generation has it."""
         serialize: Callable[..., Any] = self.store.serialize_ros1 if self._ros1 else self.store.serialize_cdr
-        return bytes(serialize(message, _TYPES[topic]))
+        return bytes(serialize(message, TYPES[topic]))
 
     def said(self, drive: FullDrive) -> Iterator[tuple[str, int, Any]]:
         """All of it; the lateness of each topic tells what comes first of what was measured at once."""
@@ -234,24 +234,24 @@ def write_robots(path: Path, drives: Mapping[str, FullDrive]) -> Path:
         raise FileExistsError(f"{path} is there already")
     if path.suffix == ".bag":
         with Bag1Writer(path) as bag:
-            _fill(bag, _Words(ros1=True), drives)
+            _fill(bag, RosWords(ros1=True), drives)
     elif path.suffix == ".mcap":  # the one of a folder
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             with Bag2Writer(Path(folder) / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-                _fill(writer, _Words(ros1=False), drives)
+                _fill(writer, RosWords(ros1=False), drives)
             (file,) = (Path(folder) / "bag").glob("*.mcap")
             shutil.move(file, path)
     else:
         with Bag2Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-            _fill(writer, _Words(ros1=False), drives)
+            _fill(writer, RosWords(ros1=False), drives)
     return path
 
 
-def _fill(writer: Any, words: _Words, drives: Mapping[str, FullDrive]) -> None:
+def _fill(writer: Any, words: RosWords, drives: Mapping[str, FullDrive]) -> None:
     topics = {
         robot + name: writer.add_connection(robot + name, kind, typestore=words.store)
         for robot in drives
-        for name, kind in _TYPES.items()
+        for name, kind in TYPES.items()
     }
     said = [(ns, robot, topic, message) for robot, drive in drives.items() for topic, ns, message in words.said(drive)]
     for ns, robot, topic, message in sorted(said, key=lambda each: each[0]):

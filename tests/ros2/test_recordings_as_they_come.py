@@ -9,6 +9,7 @@ import full_drive
 import pytest
 import recordings
 from full_drive import FIX, GRAPH, IMU, ODOM
+from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
 from test_recordings import FOUND, bits, run, same
 
@@ -207,3 +208,43 @@ def test_the_parameters_of_the_robots_bridge_are_read(
     assert "--params-file is of recordings" in capsys.readouterr().err
     file.write_text(PARAMETERS.replace("smooth_s", "smoth_s"))
     assert run(capsys, path, "--in-process", "--params-file", file)[0] == BAD_FILE
+
+
+def mcap(path: Path, profile: str, ros1: bool, encoding: str = "") -> Path:
+    """The drive by the mcap library, as `mcap convert` makes of a bag of ROS 1, or as another recorder writes it."""
+    words = full_drive.RosWords(ros1)
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile, "tests")
+        channels: dict[str, int] = {}
+        for topic, ns, message in words.said(full_drive.full_drive(20)):
+            name = full_drive.TYPES[topic]
+            if topic not in channels:
+                text, _ = words.store.generate_msgdef(name, ros_version=1 if ros1 else 2)
+                short = name.replace("/msg/", "/") if ros1 else name
+                schema = writer.register_schema(short, "ros1msg" if ros1 else "ros2msg", text.encode())
+                channels[topic] = writer.register_channel(topic, encoding or ("ros1" if ros1 else "cdr"), schema)
+            writer.add_message(channels[topic], ns, words.serialize(topic, message), ns)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(("profile", "ros1"), [("ros1", True), ("", False), ("other", False)])
+def test_an_mcap_of_another_recorder_or_of_ros_1_is_the_same_map(
+    profile: str, ros1: bool, path: Path, tmp_path: Path
+) -> None:
+    whole, file = read_recording(path, FOUND), mcap(tmp_path / "other.mcap", profile, ros1)
+    made = read_recording(file, FOUND)
+    assert same(made, whole)
+    assert made.notes == whole.notes, "nothing of it is missing"
+    file.write_bytes(file.read_bytes()[:-400])
+    cut = read_recording(file, FOUND)
+    assert [bits(a) for a in cut.steps] == [bits(b) for b in whole.steps[: len(cut.steps)]]
+    assert any("cut off or damaged" in note for note in cut.notes)
+
+
+def test_an_mcap_with_nothing_of_ros_says_what_it_has(tmp_path: Path) -> None:
+    with pytest.raises(
+        BadRecording, match="no topic of ROS in it, but /gps/fix, /imu/data_raw, /kimera/pose_graph, /odom;"
+    ):
+        read_recording(mcap(tmp_path / "proto.mcap", "", False, "protobuf"), FOUND)

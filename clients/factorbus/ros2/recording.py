@@ -19,8 +19,8 @@ from factorbus.wording import counted
 
 _LATEST = DISTRIBUTIONS["jazzy"]  # of recordings that do not say what their messages are made of
 
-
 METADATA, OF_ROSBAG2, COMPRESSED = "metadata.yaml", (".mcap", ".db3"), ".zstd"
+_OTHER_PROFILE = "Profile is not ros2"  # which rosbags says of a file that another recorder than ROS 2's has written
 
 
 class Recorded(NamedTuple):
@@ -175,8 +175,10 @@ class RobotRecording:
         except Exception as fault:
             raise BadRecording(path, f"it cannot be read ({_told(fault)})", "an MCAP file") from None
         if not source.topics:
-            raise BadRecording(path, f"no topic of ROS in it ({_told(first)})", "a robot's recording")
-        self._opened.append(f"it has no index that can be read ({_told(first)}): it is read from its beginning")
+            there = f", but {', '.join(sorted(source.unread)[:4])}" if source.unread else f" ({_told(first)})"
+            raise BadRecording(path, f"no topic of ROS in it{there}", "a robot's recording")
+        if _OTHER_PROFILE not in str(first):
+            self._opened.append(f"it has no index that can be read ({_told(first)}): it is read from its beginning")
         return source
 
 
