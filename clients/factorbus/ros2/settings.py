@@ -101,13 +101,15 @@ class Settings:
     without: frozenset[str] = frozenset()
 
     def inputs(self) -> dict[str, str]:
-        """Topics that are read, odometry first, with the type of each."""
-        odometry = {self.odometry: ODOMETRY} if self.odometry else {}
-        groups = ((self.poses, POSE), (self.landmarks, DETECTIONS), (self.landmark_lists, LANDMARK_LIST),
-                  (self.tags, TAGS), (self.pose_graphs, POSE_GRAPH), (self.map_graphs, MAP_GRAPH), (self.links, LINK),
-                  (self.fixes, FIX))  # fmt: skip
-        made = odometry | {name: type_name for names, type_name in groups for name in names}
-        return made | ({self.imu: IMU} if self.imu else {})
+        """Topics that are read, odometry first, with the type of each.  Raises BadRosName: one is of two types."""
+        groups = (((self.odometry,), ODOMETRY), (self.poses, POSE), (self.landmarks, DETECTIONS),
+                  (self.landmark_lists, LANDMARK_LIST), (self.tags, TAGS), (self.pose_graphs, POSE_GRAPH),
+                  (self.map_graphs, MAP_GRAPH), (self.links, LINK), (self.fixes, FIX), ((self.imu,), IMU))  # fmt: skip
+        made: dict[str, str] = {}
+        for name, type_name in ((name, type_name) for names, type_name in groups for name in names if name):
+            if made.setdefault(name, type_name) != type_name:
+                raise BadRosName("the topic", name, f"one type of it: here it is of {made[name]} and of {type_name}")
+        return made
 
 
 def bridge_settings(options: BridgeOptions) -> Settings:
@@ -119,8 +121,12 @@ def bridge_settings(options: BridgeOptions) -> Settings:
             "--tf-raw", options.tf_raw, "--smooth-s with it: without, --tf has transforms as the map has them"
         )
     given = robot_settings(options)
+    if not given.odometry:
+        raise BadRosName(
+            "the topic of odometry", given.odometry, "a full ROS name, such as /odom: a map is driven by it"
+        )
     # Without these options the usual topics are read.
-    return replace(
+    made = replace(
         given,
         poses=given.poses or (() if "poses" in given.without else USUAL_POSES),
         landmarks=given.landmarks or (() if "landmarks" in given.without else USUAL_LANDMARKS),
@@ -133,6 +139,8 @@ def bridge_settings(options: BridgeOptions) -> Settings:
         smooth_s=options.smooth_s,
         display_s=options.display,
     )
+    made.inputs()
+    return made
 
 
 def robot_settings(options: RobotOptions) -> Settings:
@@ -176,7 +184,9 @@ def _with_several(settings: Settings, options: RobotOptions) -> Settings:
     without = frozenset(name for name, topics in named.items() if topics == (NOTHING,))
     if settings.start == "pose" and "poses" in without:
         raise BadRosName("the topic of poses", NOTHING, "one of poses: --start pose waits for the first")
-    return replace(settings, **named | dict.fromkeys(without, ()), without=without)
+    made = replace(settings, **named | dict.fromkeys(without, ()), without=without)
+    made.inputs()
+    return made
 
 
 def _mount(text: str) -> tuple[str, Transform]:
