@@ -165,7 +165,7 @@ def command(as_json: bool, **asked: Any) -> None:
       step_ms      the step in the solver
       bus_ms       from sending the insert to having its answer and its delta here, beyond the solver's own time
                    (staging and step); with --window above 1, from sending to the answer, queueing included
-      chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step
+      chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step (null with an IMU)
       against_batch  χ² over that of the optimum found from scratch, and what led to it (start): the map's own values
                    (with --use-values the file's), composed odometry or averaged rotations, whichever ends lowest;
                    batch_converged false: its search ended before it had converged, the true optimum may be lower
@@ -391,8 +391,8 @@ def _fixed(steps: Any) -> list[str]:
 
 
 def _chi2_initial(steps: Any) -> float | None:
-    """χ² before any step, by the solver; None in a light client, which has none."""
-    if missing_modules("service"):
+    """χ² before any step, by the solver; None without one, and with an IMU, whose velocities are not odometry's."""
+    if missing_modules("service") or any(group.kind.startswith("imu") for step in steps for group in step.factors):
         return None
     from factorbus.cli.driving.local import chi2_unsolved
 
