@@ -172,3 +172,11 @@ def test_a_script_writes_it_and_one_command_makes_a_picture_and_a_trajectory(
     assert (tmp_path / "drive.png").stat().st_size > 10_000
     for text in ("odometry: /odom", f"closures: {GRAPH}", f"GNSS: {FIX}", "no fix (status -1): left out (8 times)"):
         assert text in " ".join(told.err.split())
+
+
+def test_how_far_reading_is_is_told(path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    made = read_recording(path, SETTINGS, show=lambda done, total: told.append((done, total)))
+    total = sum(made.used.values())
+    assert told == [(1000 * n, total) for n in range(1, total // 1000 + 1)]
+    assert len(told) > 10

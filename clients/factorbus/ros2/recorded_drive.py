@@ -1,7 +1,7 @@
 """What a robot's recording comes to as a map: one insert after the other, as the bridge would have sent them."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ from factorbus.ros2.recorded_topics import frame_topics, with_topics
 from factorbus.ros2.recording import Recorded, RobotRecording
 from factorbus.ros2.settings import Settings
 from factorbus.wording import counted
+
+_SHOWN_EACH = 1000  # messages
 
 
 class RecordedSteps(list[Batch]):
@@ -52,17 +54,20 @@ class RecordedDrive:
         return {"dialect": "recording", "notes": list(self.notes), **read}
 
 
-def read_recording(path: Path, settings: Settings, strict: bool = False) -> RecordedDrive:
+def read_recording(
+    path: Path, settings: Settings, strict: bool = False, show: Callable[[int, int], None] = lambda *_: None
+) -> RecordedDrive:
     """The drive in a recording.
 
     settings: as a bridge has them; an odometry of "" is found by its type, and so are landmarks where none are named.
-    strict: refuse what would be left out.
+    strict: refuse what would be left out.  show: is told, now and then, how many messages are read, of how many; 0: it
+    does not say.
     Raises BadRecording: it cannot be read, has no odometry, or, where `strict`, something in it was not used.
     """
     with RobotRecording(path) as recording:
         settings, notes = with_topics(recording, settings)
         made = _Reading(recording, settings)
-        made.read()
+        made.read(show)
         notes += [*recording.notes, *made.notes()]
     if strict and (made.left_out or recording.notes):
         raise BadRecording(path, next(iter([*recording.notes, *made.notes()])), "a recording that is used whole")
@@ -82,11 +87,14 @@ class _Reading:
         self._why: dict[str, str] = {}
         self._remarks: dict[tuple[str, str], int] = {}
 
-    def read(self) -> None:
+    def read(self, show: Callable[[int, int], None]) -> None:
         """All of it; where sensors are comes first, whenever it was said."""
+        total = sum(topic.count for topic in self._recording.topics if topic.name in self._inputs)
         for message in self._recording.messages(self._statics) if self._statics else ():
             self._hear(message)
-        for message in self._recording.messages(list(self._inputs)):
+        for number, message in enumerate(self._recording.messages(list(self._inputs)), 1):
+            if number % _SHOWN_EACH == 0:
+                show(number, total)
             if (draft := self._hear(message)) is not None:
                 self.steps.append(draft.batch())
                 self.steps.times_ns.append(self._front_end.stamp_ns)

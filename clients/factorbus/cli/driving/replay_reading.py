@@ -7,6 +7,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from factorbus.cli.output.console import reading
 from factorbus.cli.output.exits import require
 from factorbus.cli.process.reading import is_recording, read_drive, say
 from factorbus.ros2.options import RobotOptions
@@ -45,6 +46,7 @@ def read_steps(
     from factorbus.ros2.settings import Settings, robot_settings
 
     settings = robot_settings(robot) if robot else Settings(odometry="", poses=(), landmarks=())
-    drive = read_recording(file, settings, strict)
+    with reading(file.name) as show:
+        drive = read_recording(file, settings, strict, show)
     say(file, drive.notes)
     return drive, drive.steps
