@@ -248,3 +248,23 @@ def test_an_mcap_with_nothing_of_ros_says_what_it_has(tmp_path: Path) -> None:
         BadRecording, match="no topic of ROS in it, but /gps/fix, /imu/data_raw, /kimera/pose_graph, /odom;"
     ):
         read_recording(mcap(tmp_path / "proto.mcap", "", False, "protobuf"), FOUND)
+
+
+def test_a_slash_before_the_name_of_a_frame_makes_no_other_one(tmp_path: Path) -> None:
+    """As drivers and bags of ROS 1 have it: a mount was not found, and the IMU and landmarks were left out."""
+    said = recordings.drive().said
+    whole = read_recording(recordings.write_mcap(tmp_path / "plain.mcap", said), FOUND)
+    for each in said:
+        if each.topic == "/odom":
+            each.message.child_frame_id = "/base_link"
+            each.message.header.frame_id = "/odom"
+        elif each.topic == "/detections":
+            each.message.header.frame_id = "/camera"
+            for seen in each.message.detections:
+                seen.header.frame_id = "/camera"
+    made = read_recording(recordings.write_mcap(tmp_path / "slash.mcap", said), FOUND)
+    assert same(made, whole)
+    assert made.notes == whole.notes
+    asked = robot_settings(replace(OPTIONS, mounts=("/camera=0.3,0,0,0,0,0.70710678118654752,0.70710678118654752",)))
+    without = recordings.write_mcap(tmp_path / "mounted.mcap", [each for each in said if each.topic != "/tf_static"])
+    assert not read_recording(without, asked).left_out

@@ -21,7 +21,7 @@ from factorbus.ros2.fixes import Antenna, GnssFixes, read_fix
 from factorbus.ros2.geometry import Transform, carried, local
 from factorbus.ros2.graphs import heard_graph
 from factorbus.ros2.inertial import InertialChain, Moment
-from factorbus.ros2.message_parts import Notes, stamp_ns_of, transform_of
+from factorbus.ros2.message_parts import Notes, frame_name, stamp_ns_of, transform_of
 from factorbus.ros2.messages import FIX, IMU, ODOMETRY, POSE
 from factorbus.ros2.mounts import Mounts
 from factorbus.ros2.observations import LANDMARK_TYPES, LandmarkReader, cross_matrix, observations_in
@@ -180,7 +180,7 @@ class FrontEnd:
     def pose(self, topic: str, message: Any) -> Draft | None:
         """A geometry_msgs/PoseWithCovarianceStamped in the map's frame.  Raises BadRosMessage."""
         frame = message.header.frame_id
-        if frame != self._settings.map_frame:
+        if frame_name(frame) != self._settings.map_frame:
             raise BadRosMessage(topic, f"a pose in frame {frame!r}", f"one in {self._settings.map_frame!r}")
         return self._take(topic, message, self._use_pose)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from factorbus.ros2.continuity import Continues, OdometryContinuity, OdometryVerdict, ToldOdometry, speed_of
 from factorbus.ros2.geometry import Transform, local
-from factorbus.ros2.message_parts import Notes, stamp_ns_of, transform_of
+from factorbus.ros2.message_parts import Notes, frame_name, stamp_ns_of, transform_of
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
@@ -49,7 +49,7 @@ class OdometryReader:
         return "the last odometry is left out: it is far from the one before, and none follows" if held else ""
 
     def _told(self, message: Any) -> ToldOdometry:
-        frames = message.header.frame_id, message.child_frame_id or _BASE_FRAME
+        frames = frame_name(message.header.frame_id), frame_name(message.child_frame_id) or _BASE_FRAME
         if self.base_frame and frames != (self.frame, self.base_frame):
             raise BadRosMessage(self._topic, f"frames {frames}", f"{self.frame, self.base_frame} as before")
         if not message.header.frame_id:

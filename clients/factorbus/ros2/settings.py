@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from factorbus.client.imu import ImuNoise
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.geometry import Transform, from_quaternion
+from factorbus.ros2.message_parts import frame_name
 from factorbus.ros2.messages import (
     DETECTIONS,
     FIX,
@@ -163,7 +164,7 @@ def robot_settings(options: RobotOptions) -> Settings:
         imu_noise=ImuNoise(*options.imu_noise),
         robot_id=options.robot_id,
         rotation_first=options.rotation_first,
-        map_frame=options.map_frame,
+        map_frame=frame_name(options.map_frame),
         space="space" if options.space else "plane",
         letter=options.letter,
         start=options.start,

@@ -62,5 +62,9 @@ class WaitingMessages:
         """(topic, what still waits), for people, where a recording ends.  last_ns: of the last odometry."""
         first = {each.topic: each.stamp_ns for each in reversed(self._waiting)}
         for topic, count in Counter(each.topic for each in self._waiting).items():
-            after = f"{1e-9 * (first[topic] - last_ns):.4g} s"
-            yield topic, f"{counted(count, 'message')} left out at the end, from {after} after the last odometry on"
+            after = (
+                f"from {1e-9 * (first[topic] - last_ns):.4g} s after the last odometry on"
+                if last_ns
+                else "without any odometry"
+            )
+            yield topic, f"{counted(count, 'message')} left out at the end, {after}"

@@ -30,7 +30,7 @@ class NodeCommand(click.Command):
         return super().parse_args(ctx, args)
 
     def _read(self, path: Path, namespace: str, typed: Mapping[str, Any]) -> dict[str, Any]:
-        require("ros2", "--params-file")
+        require("ros2", f"factorbus {self.name} --params-file")
         from factorbus.ros2.parameters import BadParameters, node_parameters
 
         known = self.parameters()
