@@ -180,3 +180,17 @@ def test_how_far_reading_is_is_told(path: Path) -> None:
     total = sum(made.used.values())
     assert told == [(1000 * n, total) for n in range(1, total // 1000 + 1)]
     assert len(told) > 10
+
+
+def test_sensors_without_the_name_of_a_frame_are_said_to_have_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No --mount can name it: where they are has to come from the driver."""
+    header = full_drive.RosWords._header
+    nameless = lambda words, ns, frame: header(words, ns, frame if frame not in ("gps", "imu_link") else "")  # noqa: E731
+    monkeypatch.setattr(full_drive.RosWords, "_header", nameless)
+    made = read_recording(full_drive.write(tmp_path / "drive.mcap", full_drive.full_drive(20)), SETTINGS)
+    said = " ".join(made.notes)
+    assert "its messages have no frame_id, so nothing can say where it is on the robot: the IMU is not used" in said
+    assert "no frame_id: the antenna is taken to be at 'base_link' (1" in said
+    assert "--mount" not in said

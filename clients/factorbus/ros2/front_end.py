@@ -345,8 +345,10 @@ class FrontEnd:
         """Where the antenna is on the robot; in its middle, and why, where nothing says where its frame is."""
         mount = self._mounts.try_mount(self.base_frame, frame)
         if mount is None:
-            text = f"nothing says where frame {frame[:80]!r} is: the antenna is taken to be at {self.base_frame[:80]!r}"
-            return np.zeros(3), f"{text} (--mount)"
+            named, advice = (
+                (f"nothing says where frame {frame[:80]!r} is", " (--mount)") if frame else ("no frame_id", "")
+            )
+            return np.zeros(3), f"{named}: the antenna is taken to be at {self.base_frame[:80]!r}{advice}"
         return mount.t, ""
 
     def _try_node_place(self, topic: str, stamp_ns: int) -> NodePlace | None:
