@@ -87,14 +87,14 @@ def keyframes(made: ImuDrive) -> Iterator[tuple[float, F64]]:
         yield t, row
 
 
-def drafted(made: ImuDrive) -> Draft:
-    """The graph that has to come of it."""
+def drafted(made: ImuDrive, mount: F64 = MOUNT) -> Draft:
+    """The graph that has to come of it, with the IMU at `mount`."""
     (begin, first), *more = keyframes(made)
     times, rates = made.imu[:, 0], made.imu[:, 1:]
     samples = cut_samples(times, rates[:, :3], rates[:, 3:], begin, more[0][0])
-    still = initial_from_standstill(samples[:100], mount=MOUNT)
+    still = initial_from_standstill(samples[:100], mount=mount)
     bias = np.append(still.bias[:3], np.zeros(3))
-    up = rotation_of(first) @ rotation_of(MOUNT) @ samples[:100, 4:].mean(axis=0)
+    up = rotation_of(first) @ rotation_of(mount) @ samples[:100, 4:].mean(axis=0)
     draft = Draft().se3("x0", first, fixed=True, stamp=at(begin)).vector("V0", np.zeros(3)).vector("B0", bias)
     draft.linear(["V0"], [np.zeros(3)], [np.eye(3)], np.zeros(3), sigmas=[0.05] * 3)
     sigmas = np.append(np.maximum(still.sigma_gyroscope, 1e-4), [0.2] * 3)
@@ -109,6 +109,6 @@ def drafted(made: ImuDrive) -> Draft:
         draft.between_se3(f"x{n - 1}", f"x{n}", way, sigmas=floors)
         samples = cut_samples(times, rates[:, :3], rates[:, 3:], last_t, t)
         before, here = ((f"x{k}", f"V{k}", f"B{k}") for k in (n - 1, n))
-        draft.imu(before, here, samples, noise=NOISE, gravity="G0", bias=bias, mount=MOUNT)
+        draft.imu(before, here, samples, noise=NOISE, gravity="G0", bias=bias, mount=mount)
         last_t, last = t, row
     return draft

@@ -87,10 +87,10 @@ def test_the_launch_file_as_it_stands_starts_a_service_and_waits_for_it(
 
 
 def test_the_file_of_the_launch_has_the_defaults_of_the_command() -> None:
-    """But for where the robot's topics are: an empty list is the default, or takes it away."""
+    """An empty list is the default."""
     usual = {max(each.opts, key=len).lstrip("-").replace("-", "_"): each.default for each in command.params}
     for name, value in node_parameters(PARAMETERS, "/", "factorbus").items():
-        if name not in ("landmarks",) and value != []:
+        if value != []:
             assert usual[name] == (tuple(value) if isinstance(value, list) else value)
 
 

@@ -226,6 +226,14 @@ def test_options_arrive() -> None:
     with pytest.raises(BadRosName, match="--smooth-s with it"):
         bridge_settings(replace(options, smooth_s=0.0))
     assert bridge_settings(replace(options, smooth_s=0.0, tf_raw=Settings().raw_transforms)).smooth_s == 0.0
+    with pytest.raises(BadRosName, match="the topic of odometry ''"):
+        bridge_settings(replace(options, odom=""))
+    with pytest.raises(BadRosName, match=r"one type of it: here it is of nav_msgs/msg/Odometry and of .*NavSatFix"):
+        bridge_settings(replace(options, fixes=("/o",)))
+    with pytest.raises(BadRosName, match="here it is of geometry_msgs"):
+        bridge_settings(replace(options, fixes=("/initialpose",)))
+    nothing = bridge_settings(replace(options, poses=("none",), landmarks=("none",), start="odometry"))
+    assert nothing.inputs().keys() == {"/o", "/i"}
 
 
 @pytest.mark.parametrize("space", ["plane", "space"])

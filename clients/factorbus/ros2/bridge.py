@@ -65,7 +65,9 @@ class Bridge:
         for name, type_name in settings.inputs().items():
             self._listen(node, self._topic(name, type_name, 10))
         if self._front_end.waits_for_pose:
-            log.warning("waiting for a pose on %s: %s", " or ".join(settings.poses), self._why_wait())
+            log.warning(
+                "waiting for a pose on %s: %s", " or ".join(settings.poses) or "none (--pose)", self._why_wait()
+            )
 
     def run(self, stop: threading.Event) -> None:
         """Until `stop`.  Raises what the map refuses in a way that nothing here can mend."""

@@ -128,6 +128,17 @@ class GnssFixes:
         self._collected: deque[_Placed] = deque(maxlen=_COLLECTED)
         self._counts: Counter[tuple[str, int]] = Counter()
         self._has_frame = False
+        self._last: dict[str, bytes] = {}
+
+    def check_new(self, topic: str, message: Any) -> None:
+        """Raises BadRosMessage: it is the last one of its topic again, which would count twice."""
+        stamp = message.header.stamp
+        numbers = message.latitude, message.longitude, message.altitude, *message.position_covariance
+        kinds = message.status.status, message.position_covariance_type
+        one = np.array([stamp.sec, stamp.nanosec, *kinds, *numbers], np.float64).tobytes()
+        if self._last.get(topic) == one:
+            raise BadRosMessage(topic, f"a fix of {stamp.sec}.{stamp.nanosec:09d} s twice", "each fix once")
+        self._last[topic] = one
 
     def rewind(self, present: Callable[[int], bool]) -> None:
         """An insert was refused: what is not in the map is not there."""

@@ -6,7 +6,6 @@ added.  What is stamped later than the last odometry waits for the next.  Loop c
 which are placed in the same way.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -22,7 +21,7 @@ from factorbus.ros2.fixes import Antenna, GnssFixes, read_fix
 from factorbus.ros2.geometry import Transform, carried, local
 from factorbus.ros2.graphs import heard_graph
 from factorbus.ros2.inertial import InertialChain, Moment
-from factorbus.ros2.message_parts import Notes, stamp_ns_of, transform_of
+from factorbus.ros2.message_parts import Notes, frame_name, stamp_ns_of, transform_of
 from factorbus.ros2.messages import FIX, IMU, ODOMETRY, POSE
 from factorbus.ros2.mounts import Mounts
 from factorbus.ros2.observations import LANDMARK_TYPES, LandmarkReader, cross_matrix, observations_in
@@ -31,14 +30,10 @@ from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
 from factorbus.ros2.track import Correction, KeyframePlace, OdometryTrack, Sample
+from factorbus.ros2.waiting import UseMessage, WaitingMessage, WaitingMessages
 
-_WAITING = 256
 _STILL = 1e-12  # metres and radians: no way at all
-_STALE_NS = 10**9  # what is later than a clock that was set back by that is of the former clock
 _ELSEWHERE_M, _ELSEWHERE_RAD, _ELSEWHERE_SHARE = 1.0, 0.35, 0.1
-
-# What uses a message once odometry is there, of (draft, its stamp, its topic, itself).
-_Use = Callable[[Draft, int, str, Any], None]
 
 
 class FrontEnd:
@@ -55,7 +50,7 @@ class FrontEnd:
     ) -> None:  # fmt: skip
         self._settings, self._space, self._floors = settings, SPACES[settings.space], settings.floors
         self._track, self._notes = OdometryTrack(), Notes()
-        self._waiting: deque[tuple[int, str, Any, _Use]] = deque(maxlen=_WAITING)
+        self._waiting = WaitingMessages()
         self._newest: dict[str, int] = {}
         self._odometry = OdometryReader(settings, self._notes)
         self._mounts = Mounts(settings.mounts)
@@ -125,6 +120,7 @@ class FrontEnd:
         if text := self._inertial.open_ends():
             yield self._settings.imu, text
         yield from self._closures.open_ends()
+        yield from self._waiting.open_ends(self.stamp_ns)
         yield from ((" and ".join(self._settings.fixes), text) for text in self._fixes.open_ends())
 
     def take(self, topic: str, type_name: str, message: Any) -> Draft | None:
@@ -179,16 +175,12 @@ class FrontEnd:
         """What waits for a time that the former clock had is not used."""
         self._newest.clear()
         self._inertial.set_clock_back(stamp_ns)
-        waiting, last_ns = list(self._waiting), stamp_ns + _STALE_NS
-        self._waiting = deque((each for each in waiting if each[0] <= last_ns), _WAITING)
-        for at_ns, topic, _, _ in (each for each in waiting if each[0] > last_ns):
-            wanted = f"one by the clock as it was set back to, {stamp_ns} ns"
-            self.refused.append(BadRosMessage(topic, f"a stamp of {at_ns} ns", wanted))
+        self.refused += self._waiting.set_clock_back(stamp_ns)
 
     def pose(self, topic: str, message: Any) -> Draft | None:
         """A geometry_msgs/PoseWithCovarianceStamped in the map's frame.  Raises BadRosMessage."""
         frame = message.header.frame_id
-        if frame != self._settings.map_frame:
+        if frame_name(frame) != self._settings.map_frame:
             raise BadRosMessage(topic, f"a pose in frame {frame!r}", f"one in {self._settings.map_frame!r}")
         return self._take(topic, message, self._use_pose)
 
@@ -198,6 +190,7 @@ class FrontEnd:
 
     def fix(self, topic: str, message: Any) -> Draft | None:
         """A sensor_msgs/NavSatFix.  Raises BadRosMessage."""
+        self._fixes.check_new(topic, message)
         return self._take(topic, message, self._use_fix)
 
     def imu(self, topic: str, message: Any) -> Draft | None:
@@ -248,13 +241,14 @@ class FrontEnd:
             max(floors.drift_rad * metres + floors.turn_rad * radians, floors.least_rad),
         )
 
-    def _take(self, topic: str, message: Any, use: _Use) -> Draft | None:
+    def _take(self, topic: str, message: Any, use: UseMessage) -> Draft | None:
         stamp_ns = stamp_ns_of(topic, message.header.stamp)
         # What is before the last of its topic waits, too: the next odometry tells whether the clock was set back.
         newest = self._newest.get(topic, stamp_ns)
         self._newest[topic] = max(newest, stamp_ns)
         if self._track.latest is None or stamp_ns > self.stamp_ns or stamp_ns < newest:
-            self._waiting.append((stamp_ns, topic, message, use))
+            if (left := self._waiting.add(WaitingMessage(stamp_ns, topic, message, use), self.stamp_ns)) is not None:
+                self.refused.append(left)
             return None
         draft = Draft()
         self._check_covered(stamp_ns, topic)
@@ -262,9 +256,7 @@ class FrontEnd:
         return None if _is_empty(draft) else draft
 
     def _use_what_waited(self, draft: Draft) -> None:
-        due = [each for each in self._waiting if each[0] <= self.stamp_ns]
-        self._waiting = deque((each for each in self._waiting if each[0] > self.stamp_ns), _WAITING)
-        for stamp_ns, topic, message, use in due:
+        for stamp_ns, topic, message, use in self._waiting.due(self.stamp_ns):
             try:
                 self._check_covered(stamp_ns, topic)
                 use(draft, stamp_ns, topic, message)
@@ -353,8 +345,10 @@ class FrontEnd:
         """Where the antenna is on the robot; in its middle, and why, where nothing says where its frame is."""
         mount = self._mounts.try_mount(self.base_frame, frame)
         if mount is None:
-            text = f"nothing says where frame {frame[:80]!r} is: the antenna is taken to be at {self.base_frame[:80]!r}"
-            return np.zeros(3), f"{text} (--mount)"
+            named, advice = (
+                (f"nothing says where frame {frame[:80]!r} is", " (--mount)") if frame else ("no frame_id", "")
+            )
+            return np.zeros(3), f"{named}: the antenna is taken to be at {self.base_frame[:80]!r}{advice}"
         return mount.t, ""
 
     def _try_node_place(self, topic: str, stamp_ns: int) -> NodePlace | None:

@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -96,8 +97,8 @@ class ImuSamples:
         rows = self._rows(begin_ns, end_ns)
         times = np.array([self._times[n] - begin_ns for n in rows], np.int64)
         rates = np.array([self._rates[n] for n in rows], np.float64)
-        recent = np.array(list(self._times)[-_RECENT:], np.int64)
-        usual_ns = float(np.median(np.diff(recent))) if len(recent) > 1 else 0.0
+        recent = np.array(list(islice(reversed(self._times), _RECENT)), np.int64)
+        usual_ns = -float(np.median(np.diff(recent))) if len(recent) > 1 else 0.0
         if float(np.diff(np.append(times, end_ns - begin_ns)).max()) > GAP * usual_ns:
             return f"a gap in its samples, of more than {GAP:g} of their intervals"
         seconds = 1e-9 * (end_ns - begin_ns)

@@ -212,6 +212,8 @@ class InertialChain:
 
     def _say_mount(self) -> None:
         text = f"nothing says where frame {self.samples.frame[:80]!r} is on the robot: the IMU is not used (--mount)"
+        if not self.samples.frame:
+            text = "its messages have no frame_id, so nothing can say where it is on the robot: the IMU is not used"
         self._notes.remark(self._topic, text)
 
     def _say_silent(self, moment: Moment) -> None:

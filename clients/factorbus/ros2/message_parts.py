@@ -28,6 +28,11 @@ class Notes:
         return made
 
 
+def frame_name(told: str) -> str:
+    """Of a frame: "/base_link" is base_link, as tf has it; drivers and bags of ROS 1 have the slash."""
+    return told.removeprefix("/")
+
+
 def stamp_ns_of(topic: str, stamp: Any) -> int:
     """Nanoseconds of a builtin_interfaces/Time.  Raises BadRosMessage."""
     if not (0 <= stamp.sec <= LATEST_S and 0 <= stamp.nanosec < 1_000_000_000):

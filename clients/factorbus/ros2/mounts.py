@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.ros2.geometry import Transform
-from factorbus.ros2.message_parts import transform_of
+from factorbus.ros2.message_parts import frame_name, transform_of
 from factorbus.ros2.problems import BadRosMessage
 
 _FRAMES = 4096  # that are kept
@@ -16,7 +16,7 @@ class Mounts:
     """T_base_frame of the frames that static transforms join to the base frame.  given: of some, by hand."""
 
     def __init__(self, given: Mapping[str, Transform]) -> None:
-        self._given = given
+        self._given = {frame_name(frame): there for frame, there in given.items()}
         self._edges: dict[str, dict[str, Transform]] = {}
         self._found: dict[str, dict[str, Transform]] = {}
 
@@ -25,7 +25,7 @@ class Mounts:
         self._found = {}
         bad: list[BadRosMessage] = []
         for each in message.transforms:
-            parent, child = each.header.frame_id, each.child_frame_id
+            parent, child = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
             try:
                 there = transform_of(topic, each.transform)
                 if len(self._edges) >= _FRAMES and not {parent, child} <= self._edges.keys():
@@ -40,6 +40,7 @@ class Mounts:
 
     def try_mount(self, base: str, frame: str) -> Transform | None:
         """T_base_frame, if it is known."""
+        frame = frame_name(frame)
         if frame in self._given:
             return self._given[frame]
         if base not in self._found:

@@ -3,6 +3,7 @@
 Of a recording that was cut off or is damaged what can be read is read, and where that ends is noted.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,8 +19,8 @@ from factorbus.wording import counted
 
 _LATEST = DISTRIBUTIONS["jazzy"]  # of recordings that do not say what their messages are made of
 
-
-METADATA, OF_ROSBAG2 = "metadata.yaml", (".mcap", ".db3")
+METADATA, OF_ROSBAG2, COMPRESSED = "metadata.yaml", (".mcap", ".db3"), ".zstd"
+_OTHER_PROFILE = "Profile is not ros2"  # which rosbags says of a file that another recorder than ROS 2's has written
 
 
 class Recorded(NamedTuple):
@@ -59,39 +60,45 @@ class RobotRecording:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self._opened, self._damaged = path, "", ""
+        self.path, self._opened, self._damaged = path, list[str](), dict[str, str]()
         self._stack = ExitStack()
-        self._source: _Source = self._open()
+        self._sources: dict[str, _Source] = self._open()
+        self._now = next(iter(self._sources.values()))
 
     @property
     def notes(self) -> list[str]:
         """How it was opened where not as a whole, and where the last reading of it ended before its end."""
-        return [note for note in (self._opened, self._damaged) if note]
+        return [*self._opened, *self._damaged.values()]
 
     @property
     def unread(self) -> list[str]:
         """Topics that nothing is read of, as the form of their messages is not known."""
-        return sorted(self._source.unread)
+        return sorted({name for source in self._sources.values() for name in source.unread})
 
     @property
     def topics(self) -> list[RecordedTopic]:
         """All topics, by name."""
-        return sorted(self._source.topics, key=lambda topic: topic.name)
+        made: dict[tuple[str, str], int] = {}
+        for topic in (each for source in self._sources.values() for each in source.topics):
+            made[topic.name, topic.type_name] = made.get((topic.name, topic.type_name), 0) + topic.count
+        return sorted((RecordedTopic(*name, count) for name, count in made.items()), key=lambda topic: topic.name)
 
     def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
-        """Of these topics, in the order in which they were recorded, up to where it is damaged."""
-        count = 0
-        try:
-            for message in self._source.messages(topics):
-                count += 1
-                yield message
-        except Exception as fault:  # whatever the file and the libraries that read it make of the damage
-            where = f"after {counted(count, 'message')} that are read"
-            self._damaged = f"cut off or damaged {where} ({_told(fault)}): what comes before is used"
+        """Of these topics, in the order in which they were recorded, of each file up to where it is damaged."""
+        for name, source in self._sources.items():
+            self._now, count = source, 0
+            try:
+                for message in source.messages(topics):
+                    count += 1
+                    yield message
+            except Exception as fault:  # whatever the file and the libraries that read it make of the damage
+                where = f"after {counted(count, 'message')} that are read"
+                found = f"cut off or damaged {where} ({_told(fault)}): what comes before is used"
+                self._damaged[name] = f"{name} is {found}" if len(self._sources) > 1 else found
 
     def read(self, message: Recorded) -> Any:
-        """As an object.  Raises whatever the bytes lead to."""
-        return self._source.read(message)
+        """The last of `messages` as an object.  Raises whatever the bytes lead to."""
+        return self._now.read(message)
 
     def close(self) -> None:
         """Let go of the file."""
@@ -103,10 +110,49 @@ class RobotRecording:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self) -> _Source:
+    def _open(self) -> dict[str, _Source]:
+        """What it is read from, by the names of files."""
         if not self.path.exists():
             raise BadRecording(self.path, "no such file", "a rosbag2 folder, or a .mcap, .db3 or .bag file")
-        path = self._file_of_folder() if self.path.is_dir() else self.path
+        if self.path.suffix == COMPRESSED:
+            wanted = f"its folder, {self.path.parent}, or what `zstd -d` makes of it"
+            raise BadRecording(self.path, "a file that ros2 bag has compressed", wanted)
+        path = self.path.parent if self.path.name == METADATA else self.path
+        if path.is_dir():
+            return self._open_folder(path)
+        others = files_of(path.parent) if (path.parent / METADATA).is_file() else []
+        if path in others and len(others) > 1:
+            self._opened.append(f"one of the {len(others)} files of a recording; all of it is {path.parent}")
+        return {path.name: self._open_file(path)}
+
+    def _open_folder(self, path: Path) -> dict[str, _Source]:
+        """As its metadata.yaml says; where a killed recorder has not written it, or it is not so, the files in it."""
+        why = f"no {METADATA}"
+        if (path / METADATA).is_file():
+            try:
+                return {path.name: _Whole(path, self._stack)}
+            except Exception as fault:  # whatever the file and the libraries that read it make of the damage
+                why = f"it cannot be read as a whole ({_told(fault)})"
+        files = files_of(path)
+        if not files:
+            count = sum(each.suffix in OF_ROSBAG2 for each in path.iterdir())
+            wanted = f"{METADATA}, which `ros2 bag reindex` writes, or the files of one recording"
+            raise BadRecording(self.path, f"{counted(count, 'file')} and {why}", wanted)
+        sources, lost = dict[str, _Source](), list[BadRecording]()
+        for file in files:
+            try:
+                sources[file.name] = self._open_file(file)
+            except BadRecording as bad:
+                lost.append(bad)
+        if not sources:
+            raise BadRecording(
+                self.path, f"{why}, and of {files[0].name} {lost[0].detail['seen']}", str(lost[0].detail["wanted"])
+            )
+        self._opened.append(f"{why}: {', '.join(sources)} {'is' if len(sources) == 1 else 'are'} read")
+        self._opened += [f"{Path(str(bad.detail['file'])).name} is left out: {bad.detail['seen']}" for bad in lost]
+        return sources
+
+    def _open_file(self, path: Path) -> _Source:
         try:
             return _Whole(path, self._stack)
         except Exception as fault:  # whatever the file and the libraries that read it make of the damage
@@ -114,18 +160,7 @@ class RobotRecording:
         if path.suffix == ".mcap":
             return self._begun(path, first)
         advice = "reindexed by `rosbag reindex`" if path.suffix == ".bag" else "with its end"
-        raise BadRecording(self.path, f"it cannot be read ({_told(first)})", f"a whole recording, {advice}")
-
-    def _file_of_folder(self) -> Path:
-        """The folder, or the one file in it where a recorder that was killed has not written metadata.yaml."""
-        if (self.path / METADATA).is_file():
-            return self.path
-        files = sorted(each for each in self.path.iterdir() if each.suffix in OF_ROSBAG2)
-        if len(files) != 1:
-            wanted = f"{METADATA}, which `ros2 bag reindex` writes, or one file"
-            raise BadRecording(self.path, f"{counted(len(files), 'file')} and no {METADATA}", wanted)
-        self._opened = f"no {METADATA}: {files[0].name} is read"
-        return files[0]
+        raise BadRecording(path, f"it cannot be read ({_told(first)})", f"a whole recording, {advice}")
 
     def _begun(self, path: Path, first: Exception) -> _Source:
         """An MCAP file that cannot be opened as a whole, without its end for example, from its beginning."""
@@ -136,13 +171,27 @@ class RobotRecording:
         except NothingWhole as nothing:
             found = f"its {path.stat().st_size} bytes end {nothing}, so no message in it is whole"
             wanted = "more of the file; a recorder writes a chunk when it is full (ros2 bag record: --max-cache-size)"
-            raise BadRecording(self.path, found, wanted) from None
+            raise BadRecording(path, found, wanted) from None
         except Exception as fault:
-            raise BadRecording(self.path, f"it cannot be read ({_told(fault)})", "an MCAP file") from None
+            raise BadRecording(path, f"it cannot be read ({_told(fault)})", "an MCAP file") from None
         if not source.topics:
-            raise BadRecording(self.path, f"no topic of ROS in it ({_told(first)})", "a robot's recording")
-        self._opened = f"it has no index that can be read ({_told(first)}): it is read from its beginning"
+            there = f", but {', '.join(sorted(source.unread)[:4])}" if source.unread else f" ({_told(first)})"
+            raise BadRecording(path, f"no topic of ROS in it{there}", "a robot's recording")
+        if _OTHER_PROFILE not in str(first):
+            self._opened.append(f"it has no index that can be read ({_told(first)}): it is read from its beginning")
         return source
+
+
+def files_of(folder: Path) -> list[Path]:
+    """The files of one recording in a folder, in order: one, or name_0, name_1, ...; none where they are of several."""
+    files = [each for each in folder.iterdir() if each.suffix in OF_ROSBAG2]
+    if len(files) < 2:
+        return files
+    parts = [(re.fullmatch(r"(.+)_(\d+)", each.stem), each) for each in files]
+    numbered = [(int(part[2]), part[1], each) for part, each in parts if part]
+    if len(numbered) < len(files) or len({(name, each.suffix) for _, name, each in numbered}) > 1:
+        return []
+    return [each for _, _, each in sorted(numbered)]
 
 
 class _Whole:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from factorbus.client.imu import ImuNoise
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.geometry import Transform, from_quaternion
+from factorbus.ros2.message_parts import frame_name
 from factorbus.ros2.messages import (
     DETECTIONS,
     FIX,
@@ -26,6 +27,9 @@ USUAL_POSES, USUAL_LANDMARKS = ("/initialpose",), ("/detections",)
 INERTIAL_LETTERS = VELOCITY_LETTER, BIAS_LETTER, GRAVITY_LETTER = "V", "B", "G"
 # Of the key of the map's pose in the frame of GNSS, and the topic of the frames of sensors.
 FRAME_LETTER, STATIC = "f", "/tf_static"
+# In the place of topics: none of that kind is read.
+NOTHING = "none"
+_SEVERAL = ("poses", "landmarks", "landmark_lists", "tags", "pose_graphs", "map_graphs", "links", "fixes")
 LANDMARK_LETTER = "l"
 
 
@@ -61,6 +65,7 @@ class Settings:
     display_s: least time between paths.  fix_sigma_m: of fixes that do not say how good they are.
     robot_id: which robot of pose graphs this one is; None: the first that is heard.
     rotation_first: the covariances of pose graphs have rotation before translation, as GTSAM's.
+    without: names of fields with topics of which none is to be read, also where some are usual or found.
     """
 
     odometry: str = "/odom"
@@ -94,15 +99,18 @@ class Settings:
     rotation_first: bool = False
     mounts: Mapping[str, Transform] = field(default_factory=dict)
     floors: Floors = field(default_factory=Floors)
+    without: frozenset[str] = frozenset()
 
     def inputs(self) -> dict[str, str]:
-        """Topics that are read, odometry first, with the type of each."""
-        odometry = {self.odometry: ODOMETRY} if self.odometry else {}
-        groups = ((self.poses, POSE), (self.landmarks, DETECTIONS), (self.landmark_lists, LANDMARK_LIST),
-                  (self.tags, TAGS), (self.pose_graphs, POSE_GRAPH), (self.map_graphs, MAP_GRAPH), (self.links, LINK),
-                  (self.fixes, FIX))  # fmt: skip
-        made = odometry | {name: type_name for names, type_name in groups for name in names}
-        return made | ({self.imu: IMU} if self.imu else {})
+        """Topics that are read, odometry first, with the type of each.  Raises BadRosName: one is of two types."""
+        groups = (((self.odometry,), ODOMETRY), (self.poses, POSE), (self.landmarks, DETECTIONS),
+                  (self.landmark_lists, LANDMARK_LIST), (self.tags, TAGS), (self.pose_graphs, POSE_GRAPH),
+                  (self.map_graphs, MAP_GRAPH), (self.links, LINK), (self.fixes, FIX), ((self.imu,), IMU))  # fmt: skip
+        made: dict[str, str] = {}
+        for name, type_name in ((name, type_name) for names, type_name in groups for name in names if name):
+            if made.setdefault(name, type_name) != type_name:
+                raise BadRosName("the topic", name, f"one type of it: here it is of {made[name]} and of {type_name}")
+        return made
 
 
 def bridge_settings(options: BridgeOptions) -> Settings:
@@ -114,11 +122,15 @@ def bridge_settings(options: BridgeOptions) -> Settings:
             "--tf-raw", options.tf_raw, "--smooth-s with it: without, --tf has transforms as the map has them"
         )
     given = robot_settings(options)
+    if not given.odometry:
+        raise BadRosName(
+            "the topic of odometry", given.odometry, "a full ROS name, such as /odom: a map is driven by it"
+        )
     # Without these options the usual topics are read.
-    return replace(
+    made = replace(
         given,
-        poses=given.poses or USUAL_POSES,
-        landmarks=given.landmarks or USUAL_LANDMARKS,
+        poses=given.poses or (() if "poses" in given.without else USUAL_POSES),
+        landmarks=given.landmarks or (() if "landmarks" in given.without else USUAL_LANDMARKS),
         path=options.path,
         markers=options.markers,
         pose=options.pose_out,
@@ -128,6 +140,8 @@ def bridge_settings(options: BridgeOptions) -> Settings:
         smooth_s=options.smooth_s,
         display_s=options.display,
     )
+    made.inputs()
+    return made
 
 
 def robot_settings(options: RobotOptions) -> Settings:
@@ -141,22 +155,16 @@ def robot_settings(options: RobotOptions) -> Settings:
         raise BadRosName("the letter", options.letter, "another one: this is that of velocities, biases or gravity")
     if options.imu and not options.space:
         raise BadRosName("the IMU", options.imu, "poses in space, --space: in the plane there is no inertial factor")
-    return Settings(
+    if not options.imu and tuple(options.imu_noise) != USUAL_IMU_NOISE:
+        raise BadRosName("--imu-noise", str(tuple(options.imu_noise)), "--imu with the topic of the IMU that it is of")
+    made = Settings(
         odometry=options.odom,
-        poses=tuple(options.poses),
-        landmarks=tuple(options.landmarks),
-        landmark_lists=tuple(options.landmark_lists),
-        tags=tuple(options.tags),
-        pose_graphs=tuple(options.pose_graphs),
-        map_graphs=tuple(options.map_graphs),
-        links=tuple(options.links),
-        fixes=tuple(options.fixes),
         fix_sigma_m=options.fix_sigma,
         imu=options.imu,
         imu_noise=ImuNoise(*options.imu_noise),
         robot_id=options.robot_id,
         rotation_first=options.rotation_first,
-        map_frame=options.map_frame,
+        map_frame=frame_name(options.map_frame),
         space="space" if options.space else "plane",
         letter=options.letter,
         start=options.start,
@@ -165,6 +173,21 @@ def robot_settings(options: RobotOptions) -> Settings:
         mounts=dict(map(_mount, options.mounts)),
         floors=Floors(drift_m=options.drift[0], drift_rad=options.drift[0] / 2, turn_rad=options.drift[1]),
     )
+    return _with_several(made, options)
+
+
+def _with_several(settings: Settings, options: RobotOptions) -> Settings:
+    """With the topics that may be several, or none.  Raises BadRosName."""
+    named = {name: tuple(getattr(options, name)) for name in _SEVERAL}
+    for topics in named.values():
+        if NOTHING in topics and len(topics) > 1:
+            raise BadRosName("the topic", NOTHING, "topics, or none alone")
+    without = frozenset(name for name, topics in named.items() if topics == (NOTHING,))
+    if settings.start == "pose" and "poses" in without:
+        raise BadRosName("the topic of poses", NOTHING, "one of poses: --start pose waits for the first")
+    made = replace(settings, **named | dict.fromkeys(without, ()), without=without)
+    made.inputs()
+    return made
 
 
 def _mount(text: str) -> tuple[str, Transform]:

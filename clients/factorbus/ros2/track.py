@@ -150,7 +150,10 @@ class OdometryTrack:
         way = at.way if at.keyframe is self.keyframe else np.zeros((6, 6))
         made = Keyframe(key, at.T_odom_base, at.covariance, way, self._T_first_odom)
         self._keyframes.append(made)
-        self._samples = deque((_since(made, at, each) for each in self._samples), maxlen=_KEPT)
+        since: list[Sample] = []
+        while self._samples and self._samples[-1].stamp_ns >= at.stamp_ns:
+            since.append(_since(made, at, self._samples.pop()))
+        self._samples.extend(reversed(since))
         return made
 
     def try_place(self, stamp_ns: int) -> KeyframePlace | None:
@@ -221,9 +224,7 @@ class OdometryTrack:
 
 
 def _since(keyframe: Keyframe, at: Sample, sample: Sample) -> Sample:
-    """A sample once `at` is a keyframe: from there on it belongs to it, and its way is what is left of it."""
-    if sample.stamp_ns < at.stamp_ns:
-        return sample
+    """A sample from `at` on, once that is a keyframe: it belongs to it, and its way is what is left of it."""
     way = sample.way - carried(at.way, at.T_odom_base.inverse() @ sample.T_odom_base)
     return replace(sample, keyframe=keyframe, way=way)
 

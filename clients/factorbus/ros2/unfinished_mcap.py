@@ -1,7 +1,8 @@
-"""An MCAP file without its end, as a recorder that was killed leaves it: record by record, by the mcap library.
+"""An MCAP file record by record, by the mcap library: one without its end, as a recorder that was killed leaves it, or
+with messages of ROS 1, as a bag that was converted has them.
 
-rosbags wants the index at the end of the file.  Of a chunk that is cut off the records up to there are read: it is
-compressed as a stream, of which every block that is whole can be unpacked.
+rosbags wants ROS 2, and the index at the end of the file.  Of a chunk that is cut off the records up to there are read:
+it is compressed as a stream, of which every block that is whole can be unpacked.
 """
 
 import struct
@@ -16,12 +17,13 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, Footer, Message, Schema
 from mcap.stream_reader import StreamReader
 
 from factorbus.ros2.recording import Recorded, RecordedTopic, store_of
 
-_DEFINED, _ENCODED = "ros2msg", "cdr"
+# How messages are encoded, and what their definitions are written in.
+_DEFINED = {"cdr": "ros2msg", "ros1": "ros1msg"}
 _HEAD, _MAGIC = struct.Struct("<BQ"), b"\x89MCAP0\r\n"
 _BEFORE_COMPRESSION, _AFTER_IT = 28, 8  # bytes of a chunk: two times, a size and a checksum; the size of what follows
 
@@ -31,7 +33,7 @@ class NothingWhole(Exception):
 
 
 class UnfinishedMcap:
-    """The messages in it that are ROS 2's.  Raises what the library does where not even the beginning can be read."""
+    """The messages in it that are of ROS.  Raises what the library does where not even the beginning can be read."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -49,17 +51,21 @@ class UnfinishedMcap:
                 raise NothingWhole(self._where_it_ends()) from None
             if not channels:
                 raise
-        self._types = {
-            number: (channel.topic, schemas[channel.schema_id].name)
+        of_ros = {
+            number: channel
             for number, channel in channels.items()
-            if channel.message_encoding == _ENCODED
-            and channel.schema_id in schemas
-            and schemas[channel.schema_id].encoding == _DEFINED
+            if channel.schema_id in schemas
+            and _DEFINED.get(channel.message_encoding) == schemas[channel.schema_id].encoding
         }
+        self._types = {n: (each.topic, _full(schemas[each.schema_id].name)) for n, each in of_ros.items()}
+        self._encodings = {self._types[n]: each.message_encoding for n, each in of_ros.items()}
         self.unread = [channel.topic for number, channel in channels.items() if number not in self._types]
         self.topics = [RecordedTopic(*self._types[number], counts[number]) for number in self._types]
-        used = {channels[number].schema_id for number in self._types}
-        self._store = store_of([(schemas[each].name, schemas[each].data.decode()) for each in sorted(used)])
+        self._stores = {
+            encoding: store_of([(_full(schemas[each].name), schemas[each].data.decode()) for each in sorted(used)])
+            for encoding in _DEFINED
+            if (used := {each.schema_id for each in of_ros.values() if each.message_encoding == encoding})
+        }
 
     def messages(self, topics: Sequence[str]) -> Iterator[Recorded]:
         """As in `RobotRecording`."""
@@ -71,7 +77,11 @@ class UnfinishedMcap:
 
     def read(self, message: Recorded) -> Any:
         """As in `RobotRecording`."""
-        return self._store.deserialize_cdr(message.data, message.type_name)
+        encoding = self._encodings[message.topic, message.type_name]
+        store = self._stores[encoding]
+        if encoding == "ros1":
+            return store.deserialize_ros1(message.data, message.type_name)
+        return store.deserialize_cdr(message.data, message.type_name)
 
     def _is_mcap(self) -> bool:
         with self._path.open("rb") as stream:
@@ -91,6 +101,8 @@ class UnfinishedMcap:
                 for record in StreamReader(stream).records:
                     if cut is not None and stream.tell() > cut.at:
                         break  # the library makes one of whatever there is
+                    if isinstance(record, Footer):
+                        return
                     yield record
             except Exception:
                 if cut is None or stream.tell() <= cut.at:
@@ -111,6 +123,12 @@ class UnfinishedMcap:
                 if at > size:
                     return _CutRecord(begin, opcode == Opcode.CHUNK, at - size)
         return None
+
+
+def _full(name: str) -> str:
+    """nav_msgs/msg/Odometry of nav_msgs/Odometry, as ROS 1 has it."""
+    package, _, kind = name.partition("/")
+    return name if "/" in kind else f"{package}/msg/{kind}"
 
 
 class _CutRecord(NamedTuple):

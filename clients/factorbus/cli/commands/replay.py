@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from factorbus.cli.process.options import (
     out_option,
     zenoh_option,
 )
+from factorbus.cli.process.parameters_file import NodeCommand, params_file_option
 from factorbus.cli.process.reading import ROBOT_LOGS, reading_options, say
 from factorbus.cli.process.robot_options import robot_options
 from factorbus.ros2.options import RobotOptions
@@ -69,7 +70,21 @@ class ReplayRequest:
         return f"map {self.map_name} at {self.connect}" if self.connect else "a solver process of its own"
 
 
-@click.command()
+class RecordingCommand(NodeCommand):
+    """Drives what `factorbus ros2` would have heard: of its parameters file the options about the robot are read."""
+
+    def parameters(self) -> dict[str, click.Parameter | None]:
+        """Those of the node; the ones about the robot are options here, too, and have an effect."""
+        from factorbus.cli.commands.ros2 import command as node
+
+        mine, robot = super().parameters(), {each.name for each in fields(RobotOptions)}
+        return {
+            name: mine[name] if option is not None and option.name in robot else None
+            for name, option in node.parameters().items()
+        }
+
+
+@click.command(cls=RecordingCommand)
 @grouped("robot", RobotOptions)
 @file_argument("file")
 @click.option("--in-process", is_flag=True, help="Run the solver in this process, without a bus.")
@@ -122,6 +137,7 @@ class ReplayRequest:
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @reading_options
 @robot_options(usual=False)
+@params_file_option
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
     """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, JRL, BAL, or a data set's name) through a map, pose by pose.
@@ -149,7 +165,7 @@ def command(as_json: bool, **asked: Any) -> None:
       step_ms      the step in the solver
       bus_ms       from sending the insert to having its answer and its delta here, beyond the solver's own time
                    (staging and step); with --window above 1, from sending to the answer, queueing included
-      chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step
+      chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step (null with an IMU)
       against_batch  χ² over that of the optimum found from scratch, and what led to it (start): the map's own values
                    (with --use-values the file's), composed odometry or averaged rotations, whichever ends lowest;
                    batch_converged false: its search ended before it had converged, the true optimum may be lower
@@ -375,8 +391,8 @@ def _fixed(steps: Any) -> list[str]:
 
 
 def _chi2_initial(steps: Any) -> float | None:
-    """χ² before any step, by the solver; None in a light client, which has none."""
-    if missing_modules("service"):
+    """χ² before any step, by the solver; None without one, and with an IMU, whose velocities are not odometry's."""
+    if missing_modules("service") or any(group.kind.startswith("imu") for step in steps for group in step.factors):
         return None
     from factorbus.cli.driving.local import chi2_unsolved
 

@@ -7,9 +7,9 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from factorbus.cli.driving.replay_source import is_recording
+from factorbus.cli.output.console import reading
 from factorbus.cli.output.exits import require
-from factorbus.cli.process.reading import read_drive, say
+from factorbus.cli.process.reading import is_recording, read_drive, say
 from factorbus.ros2.options import RobotOptions
 
 # What is given one by one, and collected under the name of several.
@@ -22,7 +22,10 @@ _ONCE = {
 def check_kind(file: Path) -> None:
     """Raises UsageError: an option is of recordings, or of graph files, and FILE is the other."""
     given = click.get_current_context().get_parameter_source
-    of_graphs, of_recordings = ("use_values", "dialect"), ("rate", *(each.name for each in fields(RobotOptions)))
+    of_graphs, of_recordings = (
+        ("use_values", "dialect"),
+        ("rate", "params_file", *(each.name for each in fields(RobotOptions))),
+    )
     recorded = is_recording(file)
     for name in of_graphs if recorded else of_recordings:
         if given(name) is ParameterSource.COMMANDLINE:
@@ -43,6 +46,7 @@ def read_steps(
     from factorbus.ros2.settings import Settings, robot_settings
 
     settings = robot_settings(robot) if robot else Settings(odometry="", poses=(), landmarks=())
-    drive = read_recording(file, settings, strict)
+    with reading(file.name) as show:
+        drive = read_recording(file, settings, strict, show)
     say(file, drive.notes)
     return drive, drive.steps

@@ -7,15 +7,6 @@ from pathlib import Path
 from factorbus.cli.output.exits import BAD_FILE, Stopped
 from factorbus.datasets import CATALOGUE, Dataset, DatasetProblem, Places, find
 
-_RECORDINGS = (".mcap", ".db3", ".bag")
-
-
-def is_recording(path: Path) -> bool:
-    """Whether it is one by its name: a folder of rosbag2, or a file that ends as recordings do."""
-    if not path.is_dir():
-        return path.suffix in _RECORDINGS
-    return (path / "metadata.yaml").is_file() or any(each.suffix in _RECORDINGS[:2] for each in path.iterdir())
-
 
 def source_of(given: Path, places: Places | None = None, catalogue: Sequence[Dataset] = CATALOGUE) -> Path:
     """The file to read for what the command line gave.

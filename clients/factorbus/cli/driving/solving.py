@@ -15,6 +15,7 @@ from factorbus.cli.output.exits import USAGE, Stopped, output_file
 from factorbus.cli.output.starts import NOT_CONVERGED
 from factorbus.cli.process.reading import COUNTED, GRAPHS, ROBOT_LOGS, say
 from factorbus.proto.messages import Batch
+from factorbus.proto.roles import poses_aside
 from factorbus.proto.symbols import format_symbol
 from factorbus.wording import counted
 
@@ -174,7 +175,7 @@ def _check_keys(request: SolveRequest, graph: Batch) -> None:
 def _sizes(graph: Batch) -> dict[str, int]:
     kinds = [(group.kind, len(group.keys)) for group in graph.variables]
     return {
-        "poses": sum(count for kind, count in kinds if kind in ("se2", "se3")),
+        "poses": sum(count for kind, count in kinds if kind in ("se2", "se3")) - len(poses_aside(graph)),
         "landmarks": sum(count for kind, count in kinds if kind in ("point2", "point3", "idp")),
         "factors": graph.factor_count,
     }

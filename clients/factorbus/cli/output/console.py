@@ -2,8 +2,9 @@
 
 import json
 import math
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -54,7 +55,23 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int, str], None
         yield show
 
 
-def _bar() -> "Progress":
+@contextmanager
+def reading(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar that goes when it is done, where there is a terminal; call what it gives with how far and of how many."""
+    with ExitStack() as shown:
+        bar = None
+
+        def show(done: int, total: int) -> None:
+            nonlocal bar
+            if bar is None:  # what is read at once has none
+                bar = shown.enter_context(_bar(transient=True))
+                bar.add_task(f"reading {what}", total=total or None, word="")
+            bar.update(bar.task_ids[0], completed=done)
+
+        yield show if sys.stderr.isatty() else lambda *_: None
+
+
+def _bar(transient: bool = False) -> "Progress":
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -66,6 +83,7 @@ def _bar() -> "Progress":
         TextColumn("{task.fields[word]}"),
         console=Console(stderr=True, highlight=False),
         refresh_per_second=8,
+        transient=transient,
     )
 
 

@@ -17,6 +17,10 @@ _NOT_PARAMETERS = ("help", "params_file", "node", "namespace", "until_eof")
 class NodeCommand(click.Command):
     """A command whose options may be in a file: pose_graph for --pose-graph, and map for MAP."""
 
+    def parameters(self) -> dict[str, click.Parameter | None]:
+        """What may be in the file, by name; None: it has no effect here."""
+        return {_parameter(each): each for each in self.params if _parameter(each) not in _NOT_PARAMETERS}
+
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Reads the file first, as the values that options have unless they are typed."""
         if not ctx.resilient_parsing and "--help" not in args:
@@ -26,22 +30,21 @@ class NodeCommand(click.Command):
         return super().parse_args(ctx, args)
 
     def _read(self, path: Path, namespace: str, typed: Mapping[str, Any]) -> dict[str, Any]:
-        require("ros2", "factorbus ros2")
+        require("ros2", f"factorbus {self.name} --params-file")
         from factorbus.ros2.parameters import BadParameters, node_parameters
 
-        known = {_parameter(each): each for each in self.params}
-        for name in _NOT_PARAMETERS:
-            known.pop(name, None)
+        known = self.parameters()
         with input_file(path):
             given = node_parameters(path, namespace, str(typed.get("node_name", "factorbus")))
         found: dict[str, Any] = {}
         for name, value in given.items():
             if name in _WITHOUT_EFFECT:
                 continue
-            if (option := known.get(name)) is None:
+            if name not in known:
                 near = get_close_matches(name, known, 1) or sorted(known)
                 raise BadParameters(path, f"{name} is no parameter", " or ".join(near))
-            found[str(option.name)] = _as_typed(path, option, name, value)
+            if (option := known[name]) is not None:
+                found[str(option.name)] = _as_typed(path, option, name, value)
         return found
 
 

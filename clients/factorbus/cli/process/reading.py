@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from factorbus.cli.output.exits import BAD_FILE, Stopped
+
 if TYPE_CHECKING:
     from factorbus.cli.logs.sensor_log import SensorLog
     from factorbus.formats import GraphFile
@@ -18,6 +20,8 @@ COUNTED = (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor")) 
 IDS = ("auto", "ids", "keys", "counted")
 GRAPHS = (".g2o", ".pyfg", ".jrl", ".cbor")  # endings of files with the whole graph; others are trajectories
 ROBOT_LOGS = (".jrl", ".cbor")  # those that have ground truth and labels beside it; a .jrl.cbor is a .jrl in CBOR
+
+_RECORDINGS, _METADATA, _COMPRESSED = (".mcap", ".db3", ".bag"), "metadata.yaml", ".zstd"
 
 
 def reading_options(command: F) -> F:
@@ -55,9 +59,13 @@ def check_chosen(target: Path, robot: str | None, ids: str | None) -> None:
 def read_graph(path: Path, dialect: str | None = None, strict: bool = False, whole: bool = False) -> "GraphFile":
     """The graph in `path`; what was left out, assumed or changed is said on standard error.
 
-    whole: it is not to be replayed, so `strict` does not mind what no step would have.  Raises FormatError.
+    whole: it is not to be replayed, so `strict` does not mind what no step would have.  Raises FormatError, Stopped.
     """
     from factorbus.formats import read
+
+    if dialect is None and is_recording(path):
+        advice = f"factorbus replay {path} --in-process --out map.g2o makes one of it"
+        raise Stopped("bad_file", f"{path}: a robot's recording; wanted a graph: {advice}", BAD_FILE, path=str(path))
 
     graph = read(path, dialect, strict, whole)
     say(path, graph.notes)
@@ -74,6 +82,14 @@ def read_drive(path: Path, dialect: str | None = None, strict: bool = False) -> 
             say(path, log.notes)
             return log
     return read_graph(path, dialect, strict)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether it is one by its name: a folder of rosbag2 or a file in it, or a file that ends as recordings do."""
+    if not path.is_dir():
+        ending = Path(path.stem).suffix if path.suffix == _COMPRESSED else path.suffix
+        return path.name == _METADATA or ending in _RECORDINGS
+    return (path / _METADATA).is_file() or any(each.suffix in _RECORDINGS[:2] for each in path.iterdir())
 
 
 def say(path: Path, notes: tuple[str, ...]) -> None:

@@ -26,35 +26,35 @@ def robot_options(usual: bool) -> Callable[[F], F]:
                 help=f"nav_msgs/Odometry, to read.{of_type}",
             ),
             click.option(
-                "--pose", "poses", multiple=True, metavar="TOPIC",
+                "--pose", "poses", multiple=True, metavar="TOPIC|none",
                 help=f"geometry_msgs/PoseWithCovarianceStamped, to read.  [default: {poses}]",
             ),
             click.option(
-                "--landmarks", multiple=True, metavar="TOPIC",
+                "--landmarks", multiple=True, metavar="TOPIC|none",
                 help=f"vision_msgs/Detection3DArray, to read.  [default: {landmarks}]",
             ),
             click.option(
-                "--landmark-list", "landmark_lists", multiple=True, metavar="TOPIC",
+                "--landmark-list", "landmark_lists", multiple=True, metavar="TOPIC|none",
                 help=f"cartographer_ros_msgs/LandmarkList, likewise.  [default: {graphs}]",
             ),
             click.option(
-                "--tags", multiple=True, metavar="TOPIC",
+                "--tags", multiple=True, metavar="TOPIC|none",
                 help=f"AprilTagDetectionArray of apriltag_ros, likewise.  [default: {graphs}]",
             ),
             click.option(
-                "--pose-graph", "pose_graphs", multiple=True, metavar="TOPIC",
+                "--pose-graph", "pose_graphs", multiple=True, metavar="TOPIC|none",
                 help=f"pose_graph_tools_msgs/PoseGraph, whose loop closures to read.  [default: {graphs}]",
             ),
             click.option(
-                "--map-graph", "map_graphs", multiple=True, metavar="TOPIC",
+                "--map-graph", "map_graphs", multiple=True, metavar="TOPIC|none",
                 help=f"rtabmap_msgs/MapGraph, likewise.  [default: {graphs}]",
             ),
             click.option(
-                "--link", "links", multiple=True, metavar="TOPIC",
+                "--link", "links", multiple=True, metavar="TOPIC|none",
                 help=f"rtabmap_msgs/Link, between nodes of a MapGraph.  [default: {graphs}]",
             ),
             click.option(
-                "--fix", "fixes", multiple=True, metavar="TOPIC",
+                "--fix", "fixes", multiple=True, metavar="TOPIC|none",
                 help=f"sensor_msgs/NavSatFix, to read.  [default: {fixes}]",
             ),
             click.option(
