@@ -1,5 +1,6 @@
 """One drive by our solver: every step judged, and then the map is left alone until it is done."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -72,8 +73,12 @@ def follow(steps: Sequence[Batch], options: Options, every: int = 1, check: int 
 
 
 def _disagreement(judge: Judge, oracle: Oracle, estimate: Sequence[Group]) -> float:
-    """Of χ² at an estimate, and at the optimum from there."""
-    look, other = judge.look(estimate, coarse=FINE), oracle.optimum(estimate)
+    """Of χ² at an estimate, and at the optimum from there; infinite where the oracle comes to none."""
+    look = judge.look(estimate, coarse=FINE)
+    try:
+        other = oracle.optimum(estimate)
+    except ArithmeticError:  # as in a mirrored map of ranges, whose χ² is a million times what it should be
+        return math.inf
     pairs = zip((look.chi2, look.optimum), other, strict=True)
     return max(abs(mine - its) / max(its, UNIT) for mine, its in pairs)
 

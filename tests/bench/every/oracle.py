@@ -54,7 +54,7 @@ class Oracle:
             self._factors.append(_Factors(group.kind, group.loss, group.keys, group.measured, roots, scale))
 
     def optimum(self, estimate: Iterable[Group]) -> tuple[float, float]:
-        """χ² at an estimate of all variables, and at the optimum from there."""
+        """χ² at an estimate of all variables, and at the optimum from there.  Raises ArithmeticError: none is found."""
         values = {int(key): row for group in estimate for key, row in zip(group.keys, group.values, strict=True)}
         problem = _Problem(self._kinds, self._fixed, _joined(self._factors))
         x = problem.rows(values)
