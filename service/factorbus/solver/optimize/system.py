@@ -20,8 +20,9 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 
 R = TypeVar("R", bound=Factor)
 
-# How many times what counts as rounding a pivot has to be for R without damping to be tried again.
-_FAR = 4.0
+# How many times what counts as rounding a pivot has to be for R without damping to be tried again: with 4 steps beside
+# links of 1e-6 m that had gone back to R were left open.
+_FAR = 256.0
 _FREE_DIRECTION = (
     "together they leave it a direction to move in; add a prior, or a factor that measures what these do not"
 )
