@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from naive.solver_parts import graph_in
+from naive.solver_parts import graph_in, stepper_in, system_in
 from scipy.spatial.transform import Rotation
 from solver.test_converged import put
 from solver.test_decrement import drive_of, normal_equations
@@ -14,6 +14,7 @@ from factorbus.client import Draft
 from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.divergence import copied
 from factorbus.solver.errors import Underconstrained
@@ -105,6 +106,23 @@ def test_it_goes_on_to_the_bit_from_its_state(mode: str) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
+def test_a_weak_first_prior_is_no_matter_once_the_map_is_known_better(mode: str) -> None:
+    """Every loop solved all of the map by conjugate gradients for ever after."""
+    solver, plain = Solver(Options(mode=mode)), Solver(Options(mode="inc-l"))
+    drives = rig(PLANE, 120, 4, 1e6, 1e-3), rig(PLANE, 120, 4, 0.1, 1e-3)
+    for n, (given, ordinary) in enumerate(zip(*drives, strict=True)):
+        if n == 80:
+            assert is_rounded(solver)
+            given.prior_se2("x0", [0.0, 0.0, 0.0], sigmas=[0.1] * 3)
+        report, optimum = put(solver, given), put(plain, ordinary).chi2
+        assert not report.converged or report.chi2 == pytest.approx(optimum, rel=1e-3, abs=1e-6)
+    assert not is_rounded(solver)
+    while solver.unfinished:
+        solver.step()
+    assert solver.chi2() == pytest.approx(plain.step(settle=True).chi2, rel=1e-4)
+
+
+@pytest.mark.parametrize("mode", MODES)
 def test_what_nothing_holds_is_refused_beside_stiff_links(mode: str) -> None:
     solver = Solver(Options(mode=mode))
     for draft in rig(PLANE, 60, 6, 1e5, 1e-7):
@@ -152,6 +170,11 @@ def test_the_product_is_that_of_dense_matrices(name: str) -> None:
     factors = int(graph.counts[at.FACTORS])
     multiply_hessian(factors, graph.var, graph.fac, graph.values, graph.payload, x, out)
     np.testing.assert_allclose(out - 1.0, Lambda @ x, rtol=1e-9, atol=1e-9 * np.abs(Lambda).max())
+
+
+def is_rounded(solver: Solver) -> bool:
+    stepper = stepper_in(solver)
+    return stepper.tree.raised if isinstance(stepper, TreeSteps) else system_in(solver).rounded
 
 
 def stage(solver: Solver, batch: Batch) -> None:

@@ -302,6 +302,8 @@ class TreeSteps:
             rule = replace(rule, nonmonotone=0)
         result = minimize(system, chi2, damping, rule)
         if result.iterations or taken_back or not settle:
+            if not system.rounded:
+                self._tree.undamp()
             self._tree.move_all()
             self._tree.step()
             if self._tree.state.item(tl.S_RAISED) == tl.RAISED_PIVOT:

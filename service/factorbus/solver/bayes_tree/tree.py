@@ -119,7 +119,7 @@ class CliqueTree(Arenas):
 
     def move_all(self, damped: bool = False) -> None:
         """The next step moves the linearization points of all variables to the estimate; damped: and damps all pivots,
-        which later ones do, too.
+        which later ones do, too, until `undamp`.
         """
         var = self._graph.var[: self.state[tl.S_VARIABLES]]
         free = np.flatnonzero(var[:, at.V_COLUMN] >= 0)
@@ -129,6 +129,10 @@ class CliqueTree(Arenas):
         self.state[[tl.S_DUE, tl.S_ONCE]] = 1
         if self.state[tl.S_RAISED] != tl.DAMPED:
             self.state[tl.S_RAISED] = tl.DAMPED if damped else 0
+
+    def undamp(self) -> None:
+        """The next step, which moves all, damps no pivots."""
+        self.state[tl.S_RAISED] = 0
 
     def reset_to_linearization(self) -> None:
         """Put the estimate back to the linearization points: the solution of the linear problem is not taken."""

@@ -24,6 +24,7 @@ class ConjugateGradients:
     def __init__(self, factor: Factor) -> None:
         self._factor = factor
         self._graph: FactorGraph | None = None
+        self.damped_least = False  # the least damping left R positive definite
         self._damped: F64 = np.empty(0)
         self._step: F64 = np.empty(0)
 
@@ -34,6 +35,7 @@ class ConjugateGradients:
         for least in _DAMPINGS:
             failed = self._factor.factorize(graph, blocks, damping + least, watch)
             if failed < 0:
+                self.damped_least = least == _DAMPINGS[0]
                 break
         return failed
 

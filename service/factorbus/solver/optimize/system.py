@@ -20,6 +20,9 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 
 R = TypeVar("R", bound=Factor)
 
+# How many times what counts as rounding a pivot has to be for R without damping to be tried again: with 4 steps beside
+# links of 1e-6 m that had gone back to R were left open.
+_FAR = 256.0
 _FREE_DIRECTION = (
     "together they leave it a direction to move in; add a prior, or a factor that measures what these do not"
 )
@@ -29,7 +32,7 @@ class System(Generic[R]):
     """Λ, η and R of a graph at its present values.  A `LeastSquares` between `begin` and `end` of a step.
 
     within: what would leave its bounds counts as having an infinite χ², so that no step leads there
-    rounded: R has lost to rounding what some factors say, so steps are made by conjugate gradients; once, always
+    rounded: R has lost to rounding what some factors say, so steps are made by conjugate gradients, until it has not
     """
 
     NOT_KEPT = ("_before", "_exact", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph", "within")
@@ -64,6 +67,9 @@ class System(Generic[R]):
         if not self.drifted:
             self.have_lambda()
         failed = self._solver.factorize(self.graph, self.blocks, damping, self._watch)
+        if self.rounded and damping == 0.0 and failed < 0 and not self._suspects.size and self._may_have_found():
+            self.rounded = False
+            failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
         if failed >= 0:
             failed = self._factorize_rest(failed, damping)
         if damping == 0.0 and not (self.rounded or self._suspects.size):
@@ -209,6 +215,12 @@ class System(Generic[R]):
     def _has_lost(self) -> bool:
         """Whether a pivot is no more than the rounding of the largest entry."""
         return self.factor.least_pivot() <= ROUNDING * self.blocks.largest(self.graph)
+
+    def _may_have_found(self) -> bool:
+        """Whether what R had lost may be known well by now, as where positions came after a weak first prior: R of Λ
+        that is damped least has no pivot that is near rounding."""
+        near = _FAR * ROUNDING * self.blocks.largest(self.graph)
+        return self._exact.damped_least and self.factor.least_pivot() > near
 
     def _factorize_rest(self, failed: int, damping: float) -> int:
         """Factorize Λ with ones where its diagonal is zero, `suspects` apart: what every loss has set aside rests
