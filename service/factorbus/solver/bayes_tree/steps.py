@@ -102,6 +102,7 @@ class TreeSteps:
                 tree.set_budget(math.inf)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
+        self._look_again()
         escaped = self._has_escaped
         stands = not tree.state.item(tl.S_AFTER) and (bounded or not self._stalls)
         if not settle and not escaped and (stands or (bounded and self._is_tolerable)):
@@ -207,6 +208,17 @@ class TreeSteps:
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step, summed anew."""
         return self._sum_chi2(self._mark[at.FACTORS])
+
+    def _look_again(self) -> None:
+        """Where only raised pivots are left to see to: what the optimum is at least, by what another step would gain."""
+        tree, share = self._tree, self._options.converged_share
+        _, chi2, _, error, allowed, *_ = tree.totals.tolist()
+        only_raised = tree.state.item(tl.S_AFTER) == tl.RAISED and not tree.state.item(tl.S_CONTINUES)
+        if only_raised and not tree.behind and error <= allowed and not self._is_within(share, chi2):
+            most = share * self._share
+            left = tree.remaining(most)
+            if left <= most:
+                tree.totals[tl.T_LEAST] = max(chi2 - left, 0.0)
 
     def _check_determined(self) -> str:
         """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""

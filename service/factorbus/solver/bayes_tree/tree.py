@@ -17,6 +17,7 @@ from factorbus.solver.kernels.bayes_tree import records
 from factorbus.solver.kernels.bayes_tree.add_to_tree import SAVED
 from factorbus.solver.kernels.bayes_tree.changed_variables import exchange, list_changed
 from factorbus.solver.kernels.bayes_tree.hessian_room import MOST_ROOM
+from factorbus.solver.kernels.bayes_tree.remaining import remaining_decrement
 from factorbus.solver.kernels.bayes_tree.reset_estimate import reset_to_linearization
 from factorbus.solver.kernels.bayes_tree.step import tree_step
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -137,6 +138,10 @@ class CliqueTree(Arenas):
     def reset_to_linearization(self) -> None:
         """Put the estimate back to the linearization points: the solution of the linear problem is not taken."""
         reset_to_linearization(self._graph.array_table, self.array_table)
+
+    def remaining(self, most: float) -> float:
+        """What the next Gauss-Newton step would take off χ², where R is not that of Λ; above `most`: that or more."""
+        return float(remaining_decrement(most, self._graph.array_table, self.array_table))
 
     def list_changed(self, first_new: int) -> I64:
         """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""

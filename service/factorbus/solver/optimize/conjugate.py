@@ -6,7 +6,6 @@ import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64
-from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.multiply_hessian import multiply_hessian
 from factorbus.solver.optimize.factor import Factor
 from factorbus.solver.report import Stopwatch
@@ -108,6 +107,5 @@ class ConjugateGradients:
         if graph is None:
             raise ValueError("there is no factor to solve with: factorize comes first")
         out = self._damped * x
-        factors = int(graph.counts[at.FACTORS])
-        multiply_hessian(factors, graph.var, graph.fac, graph.values, graph.payload, x, out)
+        multiply_hessian(graph.array_table, x, out)
         return out

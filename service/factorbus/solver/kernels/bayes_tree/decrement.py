@@ -24,10 +24,9 @@ from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many, row_of_pair
-from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
-from factorbus.solver.kernels.model.many import linearize_kept
+from factorbus.solver.kernels.model.linearize import Scratch, make_scratch
+from factorbus.solver.kernels.model.multiply_hessian import add_product, add_product_of_many
 from factorbus.solver.kernels.model.records import Graph
-from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
 DIRECTIONS = 6  # at most: on old R the first are along what R, and not Λ, hardly holds
 
@@ -99,51 +98,15 @@ def add_difference(graph: Graph, tree: Tree, f: int, scratch: Scratch, x: F64, g
     if is_one_of_many(f, graph.fac):
         add_difference_of_many(graph, tree, f, x, gradient, out)
         return
-    var, fac, payload, r = graph.var, graph.fac, graph.payload, scratch.r
-    kind, e = fac[f, at.F_KIND], scratch.W[0]
-    dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
-    evaluate_apart(f, var, fac, graph.values, payload, r, scratch.H[0], scratch.H[1])
-    for a in range(dim if not gradient else 0):
-        r[a] = 0.0
-        for n in range(count_ends(f, fac)):
-            s = var[end_of(f, n, fac), at.V_SCALAR]
-            for c in range(dim_of_variable(var, end_of(f, n, fac)) if s >= 0 else 0):
-                r[a] += scratch.H[n, a, c] * x[s + c]
-    for a in range(dim):
-        e[a] = 0.0
-    for a in range(dim):
-        e[a] += payload[p] * r[a]
-        p += 1
-        for b in range(a + 1, dim):
-            e[a] += payload[p] * r[b]
-            e[b] += payload[p] * r[a]
-            p += 1
-    for n in range(count_ends(f, fac)):
-        s = var[end_of(f, n, fac), at.V_SCALAR]
-        for c in range(dim_of_variable(var, end_of(f, n, fac)) if s >= 0 else 0):
-            for a in range(dim):
-                out[s + c] += scratch.H[n, a, c] * e[a]
+    add_product(f, graph, scratch, x, gradient, out)
     subtract_model(graph, tree, f, x, gradient, out)
 
 
 @part
 def add_difference_of_many(graph: Graph, tree: Tree, f: int, x: F64, gradient: bool, out: F64) -> None:
     """The same of a factor that `many` evaluates."""
-    var, fac = graph.var, graph.fac
-    _, now = linearize_kept(f, var, fac, graph.values, graph.payload, kept_samples(f, var, fac, tree))
-    ends = count_ends(f, fac)
-    for a in range(len(now.J)):
-        e = now.r[a]
-        if not gradient:
-            e = 0.0
-            for n in range(ends):
-                s = var[end_of(f, n, fac), at.V_SCALAR]
-                for c in range(now.start[n], now.start[n + 1] if s >= 0 else now.start[n]):
-                    e += now.J[a, c] * x[s + c - now.start[n]]
-        for n in range(ends):
-            s = var[end_of(f, n, fac), at.V_SCALAR]
-            for c in range(now.start[n], now.start[n + 1] if s >= 0 else now.start[n]):
-                out[s + c - now.start[n]] += now.J[a, c] * e
+    ends = count_ends(f, graph.fac)
+    add_product_of_many(f, graph, kept_samples(f, graph.var, graph.fac, tree), x, gradient, out)
     for n in range(max(ends - 1, 1)):
         for m in range(n + 1, max(ends, 2)):
             subtract_model(graph, tree, row_of_pair(f, n, m, ends), x, gradient, out)
