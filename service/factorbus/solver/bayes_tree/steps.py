@@ -210,7 +210,7 @@ class TreeSteps:
         return self._sum_chi2(self._mark[at.FACTORS])
 
     def _look_again(self) -> None:
-        """Where only raised pivots are left to see to: what the optimum is at least, by what another step would gain."""
+        """What the optimum is at least, by what another step would gain, where raised pivots alone stand against it."""
         tree, share = self._tree, self._options.converged_share
         _, chi2, _, error, allowed, *_ = tree.totals.tolist()
         only_raised = tree.state.item(tl.S_AFTER) == tl.RAISED and not tree.state.item(tl.S_CONTINUES)
