@@ -18,7 +18,7 @@ from factorbus.service.solving import apply
 MODES = ("bayes-tree", "inc-l", "all-batch")
 SIGMAS = (0.05, 0.05, 0.03)
 # Maps in which values run off when an ordinary insert comes that has nothing to do with them.
-RUN_OFF = (3, 9, 27)
+RUN_OFF = (0, 4, 8)
 # Maps in which a step that settles takes back the tree's own, whose χ² is NaN, and finds nothing better.
 TAKEN_BACK = (137, 160)
 

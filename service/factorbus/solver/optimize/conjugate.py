@@ -29,7 +29,8 @@ class ConjugateGradients:
 
     def factorize(self, graph: FactorGraph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
         """As `Factor.factorize`."""
-        self._graph, self._damped = graph, damping * blocks.data[blocks.diagonal(graph)]
+        with np.errstate(over="ignore", invalid="ignore"):  # no pivot is good then
+            self._graph, self._damped = graph, damping * blocks.data[blocks.diagonal(graph)]
         failed = -1
         for least in _DAMPINGS:
             failed = self._factor.factorize(graph, blocks, damping + least, watch)
@@ -39,7 +40,11 @@ class ConjugateGradients:
         return failed
 
     def decrease(self, eta: F64, watch: Stopwatch) -> float:
-        """δᵀη with (Λ + damping · diag Λ) δ = η; the next `step` gives this δ."""
+        """δᵀη with (Λ + damping · diag Λ) δ = η; the next `step` gives this δ.  NaN where numbers do not reach."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._solve(eta, watch)
+
+    def _solve(self, eta: F64, watch: Stopwatch) -> float:
         g, x = eta.copy(), np.zeros(eta.size)
         square, p = self._precondition(g, watch)
         if not math.isfinite(square):
@@ -49,7 +54,10 @@ class ConjugateGradients:
         for _ in range(_ITERATIONS):
             Ap = self._multiply(p)
             curvature = float(p @ Ap)
-            if not curvature > 0.0:
+            if not math.isfinite(curvature):
+                self._step = p
+                return math.nan
+            if curvature <= 0.0:
                 break
             size = square / curvature
             x += size * p
