@@ -151,4 +151,4 @@ def test_poses_of_closures_that_no_new_one_is_compared_with_and_of_rejected_ones
     assert COMPARED <= len(suspects) < COMPARED + 5
     assert len(left) < count - 30
     after = decode_suspects(made.map_solver.suspects(True)).factors
-    assert sorted(made.gone) == np.setdiff1d(closures.factors, after).tolist(), "and that is told of each, once"
+    assert sorted(made.gone) == np.setdiff1d(closures.factors, after).tolist(), "each has one event"

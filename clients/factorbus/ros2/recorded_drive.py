@@ -60,8 +60,8 @@ def read_recording(
     """The drive in a recording.
 
     settings: as a bridge has them; an odometry of "" is found by its type, and so are landmarks where none are named.
-    strict: refuse what would be left out.  show: is told, now and then, how many messages are read, of how many; 0: it
-    does not say.
+    strict: refuse what would be left out.  show: called now and then with how many messages are read, of how many; 0
+    where the recording does not say.
     Raises BadRecording: it cannot be read, has no odometry, or, where `strict`, something in it was not used.
     """
     with RobotRecording(path) as recording:

@@ -1,4 +1,4 @@
-"""What is told of closures whose state is another, and of those that a map has no more."""
+"""The event of closures whose state is another, and of those that a map has no more."""
 
 from collections.abc import Iterable, Sequence, Set
 

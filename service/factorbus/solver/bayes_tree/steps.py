@@ -102,7 +102,8 @@ class TreeSteps:
                 tree.set_budget(math.inf)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
-        self._look_again()
+        if not bounded:
+            self._look_again()
         escaped = self._has_escaped
         stands = not tree.state.item(tl.S_AFTER) and (bounded or not self._stalls)
         if not settle and not escaped and (stands or (bounded and self._is_tolerable)):

@@ -4,7 +4,7 @@
     2  eliminate  children first: the rows of a clique's factors, and what its children leave, are [ R S; 0 U ] after a
                   Householder transformation; U goes to the parent
 
-Λ squares what is known, and its rounding hides what is known by 2⁻⁵² of the stiffest factor; J has that by 2⁻²⁶.
+Λ has information, σ⁻², and its rounding hides what is less than 2⁻⁵² of the most; J has σ⁻¹, and that as 2⁻²⁶ of it.
 """
 
 import numpy as np

@@ -214,12 +214,12 @@ class System(Generic[R]):
 
     def _has_lost(self) -> bool:
         """Whether a pivot is no more than the rounding of the largest entry."""
-        return self.factor.least_pivot() <= ROUNDING * self.blocks.largest(self.graph)
+        return self.factor.least_pivot() <= ROUNDING * self.blocks.largest()
 
     def _may_have_found(self) -> bool:
         """Whether what R had lost may be known well by now, as where positions came after a weak first prior: R of Λ
         that is damped least has no pivot that is near rounding."""
-        near = _FAR * ROUNDING * self.blocks.largest(self.graph)
+        near = _FAR * ROUNDING * self.blocks.largest()
         return self._exact.damped_least and self.factor.least_pivot() > near
 
     def _factorize_rest(self, failed: int, damping: float) -> int:

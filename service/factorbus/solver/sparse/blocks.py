@@ -76,9 +76,9 @@ class HessianBlocks:
             out[rows[:, at.V_SCALAR, None] + np.arange(dim)] = _diagonal(rows, dim)
         return out
 
-    def largest(self, graph: FactorGraph) -> float:
-        """The largest entry of Λ's diagonal; 0 without any."""
-        return float(self.data[self.diagonal(graph)].max(initial=0.0))
+    def largest(self) -> float:
+        """The largest entry of Λ, which is on its diagonal, as Λ is positive semidefinite; 0 without any."""
+        return float(self.data[: self.fill[1]].max(initial=0.0))
 
     def put_ones(self, graph: FactorGraph, variables: I64) -> I64:
         """Set zeros on the diagonal of Λ to one where they are of the free `variables`; gives where in `data`."""
