@@ -11,6 +11,8 @@ from hypothesis import HealthCheck, settings
 from longest import rank
 from process_state import as_it_was
 
+from examples import USUAL
+
 # Read when NumPy is loaded, here and in every process that a test starts.  By its own way a library of linear algebra
 # has a thread for each core, and those of two processes side by side wait for each other in loops: solving the dense
 # twins of `tests/solver/test_tree.py` took four times as long with two threads as with one.
@@ -23,6 +25,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # In CI every run has the same examples, so that a change is judged by what it changes; elsewhere each seeks new ones.
 settings.register_profile(
     "factorbus",
+    max_examples=USUAL,
     deadline=None,
     derandomize="CI" in os.environ,
     print_blob=True,

@@ -22,7 +22,7 @@ main() {
     folder=$(cd "$folder" && pwd)
     [ -e "$folder/system/.ready" ] || system "$folder"
     [ -e "$folder/packages/.ready" ] || packages "$folder" "$here"
-    export HOME=$folder/home FACTORBUS_CACHE=$folder/kernels PYTHONDONTWRITEBYTECODE=1
+    export QEMU_CPU=${QEMU_CPU:-cortex-a72} HOME=$folder/home FACTORBUS_CACHE=$folder/kernels PYTHONDONTWRITEBYTECODE=1
     export PYTHONPATH=$here/proto:$here/service:$here/workers:$here/clients:$folder/packages
     cd "$here"
     qemu-aarch64-static -L "$folder/system" "$folder/system/usr/bin/python3.11" "$@"

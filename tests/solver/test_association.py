@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_covariances import best_association
 
+from examples import examples
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.covariance.association import associate
@@ -14,7 +15,7 @@ from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.kernels.compatible import search
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     seed=st.integers(0, 2**32 - 1), observations=st.integers(1, 4), most=st.integers(0, 3), dim=st.sampled_from([2, 3])
 )

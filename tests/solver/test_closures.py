@@ -6,12 +6,13 @@ import math
 import numpy as np
 import pytest
 from false_closures import drive_with_false
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_poses import pose_matrix, pose_vector
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
+from examples import examples
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.closures.choosing import largest_agreeing
@@ -105,7 +106,7 @@ def test_half_a_turn_has_a_tangent_of_that_length() -> None:
     assert np.linalg.norm(tangent_of(T)) == pytest.approx(math.pi)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(seed=seeds, d=spaces)
 def test_one_closure_against_the_map_is_as_with_dense_derivatives(seed: int, d: int) -> None:
     c = closures_between(3, d, np.random.default_rng(seed), 1e-4)
@@ -119,7 +120,7 @@ def test_one_closure_against_the_map_is_as_with_dense_derivatives(seed: int, d: 
         assert found.distance[k] == pytest.approx(r @ np.linalg.solve(S, r), rel=1e-2)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(seed=seeds, d=spaces)
 def test_two_closures_against_each_other_are_as_with_dense_derivatives(seed: int, d: int) -> None:
     c = closures_between(3, d, np.random.default_rng(seed), 1e-4)
@@ -166,7 +167,7 @@ def test_half_of_the_distance_counts_in_space() -> None:
     assert near.chance[0, 0] == pytest.approx((2 * math.pi) ** 1.5 * 0.1 * 0.1 * 0.05 / 100.0)
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(seed=seeds, n=st.integers(0, 8), share=st.floats(0.2, 0.9))
 def test_the_largest_set_is_what_trying_everything_finds(seed: int, n: int, share: float) -> None:
     agree = np.random.default_rng(seed).random((n, n)) < share

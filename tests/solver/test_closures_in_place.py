@@ -5,9 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from false_closures import drive_with_false
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options
 from factorbus.solver.closures.evidence import weights_without
@@ -36,7 +37,7 @@ def clean() -> GatedSolver:
     return made
 
 
-@settings(deadline=None, max_examples=60)
+@examples(60)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6))
 def test_the_worst_are_those_that_sorting_all_of_them_gives(clean: GatedSolver, seed: int, room: int) -> None:
     rng, ledger = np.random.default_rng(seed), clean.ledger.of_kind[_PLANE]

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from naive.dense_covariances import DenseCovariance
 from naive.dense_least_squares import DenseGraph
 from naive.random_graphs import random_steps
 from naive.solver_parts import fixed_in, graph_in, keys_in, kinds_in, linearization_points
 
+from examples import examples
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import FactorGroup, Group, Options, Solver, errors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
@@ -53,7 +54,7 @@ def close(found: np.ndarray, wanted: np.ndarray, tell: float = 1e-8) -> None:
     np.testing.assert_allclose(found, wanted, rtol=0, atol=tell * max(np.abs(wanted).max(initial=0.0), 1e-12))
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(seed=st.integers(0, 2**32 - 1), mode=st.sampled_from(MODES))
 def test_blocks_are_those_of_the_dense_inverse(seed: int, mode: str) -> None:
     solver = solved(seed, mode)
@@ -73,7 +74,7 @@ def test_blocks_are_those_of_the_dense_inverse(seed: int, mode: str) -> None:
         np.testing.assert_allclose(found[:da, :db], wanted, rtol=0, atol=twin.tell * scale[0, 0])
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_one_matrix_by_columns_is_that_of_the_joint_covariance(seed: int) -> None:
     """Of many variables columns are made: 1,900 of a map of 10,000 poses took 88 s of a core without."""
@@ -125,7 +126,7 @@ def test_pairs_are_the_right_way_round_whichever_end_repeats(ends: tuple[int, in
         np.testing.assert_allclose(found[: dims[a], : dims[b]], whole[: dims[a], dims[a] :], rtol=1e-9, atol=1e-14)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_column_that_is_made_with_all_blocks(seed: int) -> None:
     solver = solved(seed, "bayes-tree", steps=12)
@@ -206,7 +207,7 @@ def candidates(solver: Solver, seed: int) -> list[FactorGroup]:
     return groups
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_candidates_of_every_kind(seed: int) -> None:
     solver = solved(seed, "all-batch")
@@ -242,7 +243,7 @@ def test_candidates_that_no_insert_could_bring_are_refused() -> None:
     assert evaluate_candidates(blocks, []).distance.size == 0
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_relative_covariance_is_that_of_the_relative_value(seed: int) -> None:
     """Against differences of x_i⁻¹ x_j in its own tangent space, and the dense joint covariance."""
@@ -302,7 +303,7 @@ def test_relative_to_a_point_is_refused() -> None:
         relative(blocks, np.array([0]), np.array([0]))
 
 
-@settings(max_examples=8, deadline=None)
+@examples(8)
 @given(seed=st.integers(0, 2**32 - 1))
 @example(seed=111)  # a point so near that what little is left to solve would move linearization points off the estimate
 def test_why_a_factor(seed: int) -> None:

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from factorbus.solver.covariance.kernels import tiles, tiles_plain
 from factorbus.solver.covariance.kernels.compile import DISABLED, F64, I64, kernel
 from factorbus.solver.kernels.jit.simd import LANES
@@ -29,7 +30,7 @@ def up(count: int, multiple: int) -> int:
     return -(-count // multiple) * multiple
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(rows=st.integers(0, 30), columns=st.integers(0, 30), negative=st.booleans(), seed=st.integers(0, 99))
 def test_a_transpose_of_any_size(rows: int, columns: int, negative: bool, seed: int) -> None:
     """All of it is right, and what is behind whole runs of the target's rows, and its other rows, stays."""
@@ -44,7 +45,7 @@ def test_a_transpose_of_any_size(rows: int, columns: int, negative: bool, seed: 
     np.testing.assert_array_equal(a, wanted)
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(rows=st.integers(1, 4), count=st.integers(0, 9), seed=st.integers(0, 99))
 def test_runs_of_some_rows(rows: int, count: int, seed: int) -> None:
     rng, lds, ldt = np.random.default_rng(seed), 50, 40

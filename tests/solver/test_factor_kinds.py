@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_derived import base_ends, is_derived, parts_of, with_further
 from naive.dense_factors import jacobians, pose_matrix, pose_vector, residual
@@ -11,6 +11,7 @@ from naive.random_graphs import random_information, random_value
 from naive.random_lenses import LENS_KINDS, random_lens_factor
 from naive.random_others import LINEAR, OTHERS, SIMILAR_ENDS, random_other
 
+from examples import examples
 from factorbus.proto import kinds as wire
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver.graph.admission import admit
@@ -88,7 +89,7 @@ def test_residual_and_jacobians_are_the_twins(kind: FactorKind, seed: int) -> No
 
 
 @calibrated_kind
-@settings(max_examples=30)
+@examples(30)
 @given(seed=seeds)
 def test_residual_and_jacobians_by_further_variables_are_the_twins(kind: FactorKind, seed: int) -> None:
     check(kind, seed)

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_factors import boxplus, jacobians, residual
 from naive.dense_imu import covariance, follow, integrate, samples
 from naive.random_imu import GRAVITY, KINDS, keys_of, random_ends, random_imu
 from scipy.spatial.transform import Rotation
 
+from examples import examples
 from factorbus.proto import inertial as of
 from factorbus.proto.inertial import ImuForm
 from factorbus.proto.kinds import FACTOR_KINDS, inertial_kind
@@ -66,7 +67,7 @@ def linearized(z: np.ndarray, ends: list[np.ndarray], form: ImuForm | None = Non
 
 
 @pytest.mark.parametrize("name", FORMS)
-@settings(max_examples=5)
+@examples(5)
 @given(seed=seeds, mounted=st.booleans())
 def test_residual_and_jacobians_are_those_of_the_dense_twin(name: str, seed: int, mounted: bool) -> None:
     rng, form = np.random.default_rng(seed), FORMS[name]

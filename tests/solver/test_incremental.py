@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.block_rows import dense_lambda, dense_r
 from naive.cholmod import cholmod
@@ -18,6 +18,7 @@ from naive.dense_least_squares import DenseGraph
 from naive.random_graphs import factor, random_steps
 from naive.solver_parts import graph_in, system_in
 
+from examples import examples
 from factorbus.cli.process.options import MODES as CLI_MODES
 from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -134,7 +135,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
     return steps
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(steps=drives(), way=st.sampled_from(sorted(WAYS)), tol=st.sampled_from([0.0, 1e-3, 1e6]))
 def test_r_follows_loops_of_any_length(steps: list[Batch], way: str, tol: float) -> None:
     solver, _ = follow(steps, incremental_tolerance=tol, **WAYS[way])

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_factors import pose_matrix, pose_vector
 from naive.dense_least_squares import distance
@@ -17,6 +17,7 @@ from naive.random_others import other_steps
 from naive.random_similar import similar_steps
 from naive.solver_parts import graph_in, joined_by
 
+from examples import examples
 from factorbus.proto.kinds import MOST_JOINED
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
@@ -75,7 +76,7 @@ def assert_same(solver: Solver, after: Solver, gone: list[int], settled: float =
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("world", WORLDS)
-@settings(max_examples=10)  # of 21 cases, each of some ten solvers
+@examples(10)  # of 21 cases, each of some ten solvers
 @given(seed=seeds)
 def test_any_variables_may_go(world: str, mode: str, seed: int) -> None:
     rng = np.random.default_rng(seed)

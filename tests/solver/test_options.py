@@ -6,9 +6,10 @@ import sys
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from factorbus.solver import Options, Tuning
 from factorbus.solver.errors import BadOption, SolverError
 from factorbus.solver.option_ranges import RANGES, SWITCHES
@@ -80,7 +81,7 @@ def test_what_is_no_switch_no_clock_and_no_name_is_refused(name: str) -> None:
             Options.of(**{name: wrong})
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(name=st.sampled_from(sorted(RANGES)), value=st.floats() | st.integers() | st.booleans() | JUNK)
 def test_any_value_is_taken_as_it_is_or_refused(name: str, value: Any) -> None:
     allowed = RANGES[name]

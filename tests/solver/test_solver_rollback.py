@@ -4,11 +4,12 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.random_graphs import random_steps
 from naive.solver_parts import graph_in, stepper_in, system_in
 
+from examples import examples
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
 
@@ -39,7 +40,7 @@ def loose_ends(rng: np.random.Generator) -> Batch:
     )
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(seed=st.integers(0, 2**32 - 1), refuse=st.lists(st.booleans(), min_size=6, max_size=6), fold=st.integers(1, 3))
 def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool], fold: int) -> None:
     rng = np.random.default_rng(seed)
@@ -64,7 +65,7 @@ def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool], fold: int) 
     assert state(tried) == state(spared)
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 200))
 def test_a_failure_anywhere_within_a_step_is_taken_back(seed: int, cut: int) -> None:
     """The clock is called throughout a step, so a clock that fails interrupts it anywhere."""

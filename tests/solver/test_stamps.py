@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.random_graphs import camera_steps, random_steps
 from naive.solver_parts import graph_in
 
+from examples import examples
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
@@ -71,7 +72,7 @@ def test_the_wire_and_the_solver_agree_on_what_none_is() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@settings(max_examples=8)
+@examples(8)
 @given(seed=seeds)
 def test_every_answer_has_the_stamps_that_came_in(mode: str, seed: int) -> None:
     solver, wanted = Solver(Options(mode=mode)), {}

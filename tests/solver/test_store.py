@@ -1,10 +1,11 @@
 """Memory of the tree: every double belongs to one block, in use or free; and what a drive leaves free is used again."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.tree_records import tree_of
 
+from examples import examples
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
 from factorbus.solver.bayes_tree.tree import CliqueTree
@@ -44,7 +45,7 @@ def check_tiling(used: list[tuple[int, int]], numbers: np.ndarray, state: np.nda
     assert sum(size for _, size in free) == state[tl.S_IDLE]
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 700)), max_size=80))
 def test_blocks_never_overlap(wanted: list[tuple[bool, int]]) -> None:
     numbers, state = np.zeros(ROOM), np.zeros(tl.S_SIZE, np.int64)

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_factors import boxplus
 from naive.dense_least_squares import DenseGraph, distance
@@ -15,6 +15,7 @@ from naive.solver_parts import graph_in
 from naive.tree_records import assert_is_a_tree, tree_of
 from naive.tree_solution import assert_is_solution, assert_solves
 
+from examples import examples
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import FactorGroup, Group, Options, Solver, errors, solve_batch
@@ -110,7 +111,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
     return steps
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(steps=drives(), way=st.sampled_from(sorted(WAYS)), threshold=st.sampled_from([0.0, 0.05, 1e9]))
 def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: str, threshold: float) -> None:
     solver = follow(steps, **WAYS[way], relinearize_threshold=threshold, converged_share=1e9)
@@ -134,7 +135,7 @@ def test_what_is_left_undone_does_not_add_up() -> None:
     assert coarse.max() > 1.005
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(seed=st.integers(0, 2**32 - 1), refuse=st.lists(st.booleans(), min_size=6, max_size=6))
 def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool]) -> None:
     tried, spared = Solver(Options(mode="bayes-tree")), Solver(Options(mode="bayes-tree"))
