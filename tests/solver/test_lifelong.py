@@ -14,7 +14,7 @@ from factorbus.solver.changing import with_changes
 from factorbus.solver.errors import BadOption
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import Addition
-from factorbus.solver.graph.quadratic import quadratic
+from factorbus.solver.graph.whitened import whitened
 from factorbus.solver.lifelong.eliminating import try_eliminate
 from factorbus.solver.lifelong.plan import KeepPlan, plan_removals
 from factorbus.solver.lifelong.policy import KeepPolicy
@@ -161,7 +161,7 @@ def inside(ends: list[int]) -> np.ndarray:
 
 def dense(graph: FactorGraph, rows: list[int], ends: list[int], gone: int) -> np.ndarray:
     """Λ of the ends but the first, `gone` marginalized, from the factors of all five."""
-    whole = quadratic(graph, rows, list(range(5)))
+    whole = whitened(graph, rows, list(range(5)))
     keep, out = inside(ends), 3 * gone + np.arange(3)
     L = whole.information
     return L[np.ix_(keep, keep)] - L[np.ix_(keep, out)] @ np.linalg.solve(L[np.ix_(out, out)], L[np.ix_(out, keep)])
@@ -175,7 +175,7 @@ def lambda_of(solver: Solver, term: RelativeTerm) -> np.ndarray:
     other.stage(Batch((), (Factors(kind, np.array([[term.i, term.j]]), z[None], upper[None]),)))
     graph = other.factor_graph
     graph.values[:] = solver.factor_graph.values[: graph.values.size]
-    whole = quadratic(graph, [4], list(range(5)))
+    whole = whitened(graph, [4], list(range(5)))
     out = np.zeros((15, 15))
     size = whole.information.shape[0]
     out[:size, :size] = whole.information

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from naive.dense_least_squares import distance
 from naive.solver_parts import graph_in, joined_by
+from solver.test_converged import put
 
+from factorbus.client import Changes, Draft
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
@@ -188,3 +190,42 @@ def test_a_window_over_a_long_drive_takes_constant_memory(poses: int) -> None:
     assert max(sizes[1:]) <= 1.2 * sizes[1], "it does not grow with the length of the drive"
     where = values(solver)[symbol("x", poses - 1)][1]
     assert np.hypot(*where[:2]) < 30.0, "the positions hold it, however long ago the first were"
+
+
+def weakly_held(prior: float) -> Solver:
+    """60 poses in a row with short loops, and a first prior of this σ, m and rad."""
+    rng, solver, sigmas = np.random.default_rng(3), Solver(Options(mode="bayes-tree")), np.array([0.05, 0.05, 0.01])
+    for k in range(60):
+        draft = Draft().se2(f"x{k}", (float(k), 0.0, 0.0))
+        if k == 0:
+            draft.prior_se2("x0", (0.0, 0.0, 0.0), sigmas=[prior] * 3)
+        else:
+            draft.between_se2(f"x{k - 1}", f"x{k}", [1.0, 0.0, 0.0] + sigmas * rng.normal(size=3), sigmas=sigmas)
+        if k % 10 == 9:
+            draft.between_se2(f"x{k - 8}", f"x{k}", [8.0, 0.0, 0.0] + sigmas * rng.normal(size=3), sigmas=sigmas)
+        put(solver, draft)
+    return solver
+
+
+@pytest.mark.parametrize("settle", [False, True])
+@pytest.mark.parametrize("prior", [1e3, 1e4, 1e5])
+def test_what_a_weak_prior_says_goes_to_the_next_pose(prior: float, settle: bool) -> None:
+    solver = weakly_held(prior)
+    made, *_ = with_changes(solver, Changes().marginalize("x0").listed(), None, settle)
+    assert made.chi2() == pytest.approx(solver.chi2(), rel=1e-4)
+    assert covariance(made, 1).diagonal() == pytest.approx(covariance(solver, 1).diagonal(), rel=1e-2)
+
+
+@pytest.mark.parametrize("prior", [1e3, 1e4, 3e4, 1e5])
+def test_no_marginal_leads_away_from_the_optimum(prior: float) -> None:
+    """Where R has to be damped, the estimate stays what it was before R was made without: χ² went up to 1.5 10⁷."""
+    solver = weakly_held(prior)
+    made, _, report, _ = with_changes(solver, Changes().marginalize("x0", "x3").listed())
+    for _ in range(3):
+        assert report.chi2 == pytest.approx(solver.chi2(), rel=1e-4)
+        report = made.step()
+
+
+def test_a_marginal_that_cannot_hold_the_map_is_named() -> None:
+    with pytest.raises(errors.Underconstrained, match="marginalized may have been all that says where the map is"):
+        with_changes(weakly_held(1e5), Changes().marginalize("x0", "x1", "x2").listed())

@@ -138,6 +138,25 @@ def test_what_nothing_holds_is_refused_beside_stiff_links(mode: str) -> None:
     np.testing.assert_allclose(found, point, atol=1e-3)
 
 
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("stiff", [1e-4, 1e-6, 1e-7, 1e-8])
+def test_two_new_poses_on_a_stiff_link_are_held_by_what_they_see(stiff: float, mode: str) -> None:
+    """Each sees one point, which leaves it free; Λ in doubles does not show that the link holds them."""
+    solver, known = Solver(Options(mode=mode)), Draft().se2("x0", (0.0, 0.0, 0.0))
+    known.prior_se2("x0", (0.0, 0.0, 0.0), sigmas=[0.1, 0.1, 0.02])
+    for k, y in enumerate((-3.0, -1.0)):
+        known.point2(f"l{k}").landmark_se2("x0", f"l{k}", (3.0 + k, y), sigmas=[0.1, 0.1])
+    put(solver, known)
+    both = Draft().se2("y0", (1.0, 0.0, 0.0)).se2("y1", (1.5, 0.0, 0.0))
+    both.between_se2("y0", "y1", (0.5, 0.0, 0.0), sigmas=[stiff] * 3)
+    both.landmark_se2("y0", "l0", (2.0, -3.0), sigmas=[0.1, 0.1])
+    alone = copied(solver)
+    put(solver, both.landmark_se2("y1", "l1", (2.5, -1.0), sigmas=[0.1, 0.1]))
+    assert solver.chi2() == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(Underconstrained):
+        put(alone, Draft().se2("y0", (1.0, 0.0, 0.0)).landmark_se2("y0", "l0", (2.0, -3.0), sigmas=[0.1, 0.1]))
+
+
 @pytest.mark.parametrize("space", [PLANE, SPACE])
 @pytest.mark.parametrize(("mode", "stiff", "prior"), [("auto", 1e-7, 0.1), ("inc-l", 1e-7, 0.1), ("auto", 1e-8, 1e5)])
 def test_covariances_are_those_of_links_that_are_no_rounding(mode: str, stiff: float, prior: float, space: int) -> None:

@@ -7,11 +7,17 @@ from factorbus.solver.changes.convert_to_points import pick_features, with_point
 from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.in_place import try_in_place
 from factorbus.solver.changes.requested import ChangeLike, collect
+from factorbus.solver.errors import Underconstrained
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.groups import Addition, BatchLike
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
+
+_OF_MARGINALS = (
+    "what is marginalized may have been all that says where the map is, and so much less well than it says where "
+    "variables are to each other that a linear factor cannot hold it: keep it, or add a better prior first"
+)
 
 
 def with_changes(
@@ -35,7 +41,13 @@ def with_changes(
     first = made._graph.next_id if batch is None else made.stage(batch)
     new = made.variable_count - before[0], made.factor_count - before[1]
     with made.within_bounds() if within else nullcontext():
-        report = made._stepper.resume(settle)
+        try:
+            report = made._stepper.resume(settle)
+        except Underconstrained as error:
+            if not edits.added:
+                raise
+            key, factors, missing = (error.detail[name] for name in ("key", "factors", "missing"))
+            raise Underconstrained(key, factors, f"{missing}; {_OF_MARGINALS}") from None
     report = report._replace(new_variables=new[0], new_factors=new[1])
     return made, first, report, edits.counted
 

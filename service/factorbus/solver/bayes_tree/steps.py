@@ -320,6 +320,7 @@ class TreeSteps:
             self._tree.move_all()
             self._tree.step()
             if self._tree.state.item(tl.S_RAISED) == tl.RAISED_PIVOT:
+                self._tree.reset_to_linearization()
                 self._tree.move_all(damped=True)
                 self._tree.step()
             most = result.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN

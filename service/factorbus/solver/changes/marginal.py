@@ -12,13 +12,14 @@ from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, of_whole_factors
 from factorbus.solver.graph.groups import FactorGroup
-from factorbus.solver.graph.quadratic import Quadratic, kind_of, quadratic
+from factorbus.solver.graph.whitened import Whitened, kind_of, whitened
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
-# Below this share of the largest eigenvalue a direction of the separator is not known at all; nor is a scalar of which
-# no more than this share is left of what was known of it.
-_NOTHING = 1e-13
+# Of the square root of what is known: a scalar of which no more than this is left beside what goes is not known at all,
+# nor is a direction, in columns of length 1, beside the best known one.  Λ in doubles has no more, and Jacobians of a
+# map that lies some thousand kilometres from its origin are 10⁻⁹ off.
+_NOTHING = 1e-8
 
 
 def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[FactorGroup], list[int]]:
@@ -31,7 +32,7 @@ def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[Fac
     for part, rows in _components(graph, gone, kept):
         used += rows
         _check_separator(graph, part or gone[:1].tolist(), rows, gone)
-        whole = quadratic(graph, rows, part)
+        whole = whitened(graph, rows, part)
         separator = whole.variables[len(part) :]
         if separator:
             made += _as_factors(graph, separator, *reduced(graph, whole, len(part)))
@@ -77,65 +78,51 @@ def _check_separator(graph: FactorGraph, part: list[int], rows: list[int], gone:
         raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[separator].tolist(), MOST_JOINED)
 
 
-def reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64]:
-    """Λ and η of the separator once the first `count` variables have taken theirs.  (11.4)"""
-    if not count:
-        return whole.information, whole.eta
-    cut = whole.starts[whole.variables[count]]
-    inner, cross = whole.information[:cut, :cut], whole.information[:cut, cut:]
-    try:
-        L = np.linalg.cholesky(inner)
-    except np.linalg.LinAlgError:
+def reduced(graph: FactorGraph, whole: Whitened, count: int) -> tuple[F64, F64]:
+    """R, upper triangular, and d: |R δ − d|² is what is left on the separator, but for a constant, with the best δ of
+    the first `count` variables.  (11.4), by Householder transformations, as Λ has lost what R has not."""
+    J, n = whole.J, whole.J.shape[1]
+    cut = n if count == len(whole.variables) else whole.starts[whole.variables[count]]
+    stacked = np.zeros((max(len(J), n), n + 1))
+    stacked[: len(J), :n], stacked[: len(J), n] = J, -whole.r
+    # The largest first: a transformation that begins with a small row would round what it takes from the others.
+    largest = np.abs(stacked[:, :n]).max(1, initial=0.0)
+    R = np.asarray(np.linalg.qr(stacked[np.argsort(-largest, kind="stable")], mode="r"))
+    length = np.sqrt((J * J).sum(0))
+    if (np.abs(R.diagonal()[:cut]) <= _NOTHING * length[:cut]).any():
         key, factors = int(graph.keys[whole.variables[0]]), graph.factors_of(whole.variables[0])
-        raise errors.Underconstrained(
-            key, factors, "its own factors leave it free; it cannot be marginalized"
-        ) from None
-    across, along = np.linalg.solve(L, cross), np.linalg.solve(L, whole.eta[:cut])
-    information, eta = whole.information[cut:, cut:] - across.T @ across, whole.eta[cut:] - across.T @ along
+        raise errors.Underconstrained(key, factors, "its own factors leave it free; it cannot be marginalized")
+    left = R[cut:n, cut:]
     # Of a scalar that is known only with what goes, nothing is left but rounding.
-    nothing = information.diagonal() <= _NOTHING * whole.information.diagonal()[cut:]
-    information[nothing], information[:, nothing], eta[nothing] = 0.0, 0.0, 0.0
-    return information, eta
+    left[:, :-1][:, np.sqrt((left[:, :-1] ** 2).sum(0)) <= _NOTHING * length[cut:]] = 0.0
+    return left[:, :-1], left[:, -1]
 
 
-def _as_factors(graph: FactorGraph, separator: list[int], information: F64, eta: F64) -> list[FactorGroup]:
-    """A factor on the separator with these Λ and η; none where they say nothing."""
+def _as_factors(graph: FactorGraph, separator: list[int], R: F64, d: F64) -> list[FactorGroup]:
+    """A factor on the separator with |R δ − d|²; none where it says nothing."""
     kinds, keys = [kind_of(graph, v).name for v in separator], graph.keys[separator]
     y = [_value(graph, v) for v in separator]
-    if len(separator) == 1 and kinds[0] in ("point2", "point3") and _is_determined(information):
-        return [_prior(kinds[0], keys, y[0], information, eta)]
-    R, d = _root(information, eta)
+    R, d = _of_full_rank(R, d)
     if not len(R):
         return []
+    if len(separator) == 1 and kinds[0] in ("point2", "point3") and len(R) == len(y[0]):
+        # Of a point that is determined a linear factor is a prior.
+        z = y[0] + np.linalg.solve(R, d)
+        return [FactorGroup(f"prior_{kinds[0]}", keys[:, None], z[None], (R.T @ R)[np.triu_indices(z.size)][None])]
     dims = np.cumsum([kind_of(graph, v).dim for v in separator])
     H = [block.reshape(-1) for block in np.split(R, dims[:-1], axis=1)]
     of, upper = linear_kind(len(R), tuple(kinds)), np.eye(len(R))[np.triu_indices(len(R))]
     return [FactorGroup(of.name, keys[None], np.concatenate([*y, *H, -d])[None], upper[None])]
 
 
-def _is_determined(information: F64) -> bool:
-    return bool(np.linalg.eigvalsh(information)[0] > _NOTHING * np.abs(information).max())
-
-
-def _prior(kind: str, keys: I64, y: F64, information: F64, eta: F64) -> FactorGroup:
-    """Of a point that is determined a linear factor is a prior."""
-    z = y + np.linalg.solve(information, eta)
-    upper = 0.5 * (information + information.T)[np.triu_indices(z.size)]
-    return FactorGroup(f"prior_{kind}", keys[:, None], z[None], upper[None])
-
-
-def _root(information: F64, eta: F64) -> tuple[F64, F64]:
-    """R (rank, n), upper triangular, and d with RᵀR = Λ and Rᵀd = η."""
+def _of_full_rank(R: F64, d: F64) -> tuple[F64, F64]:
+    """R (rank, n), upper triangular, and d that say the same, without directions of which nothing is known."""
     # Without units: what is known of an angle and of a place differ by as much as their scales.
-    D = np.sqrt(np.maximum(information.diagonal(), 0.0))
-    inverse = np.where(D > 0.0, 1.0 / np.where(D > 0.0, D, 1.0), 0.0)
-    S = information * inverse * inverse[:, None]
-    values, V = np.linalg.eigh(0.5 * (S + S.T))
-    known = values > _NOTHING * max(values[-1], 0.0)
-    root = np.sqrt(values[known])
-    along = (V[:, known].T @ (inverse * eta)) / root
-    Q, R = np.linalg.qr(root[:, None] * V[:, known].T * D)
-    return np.triu(R), Q.T @ along
+    D = np.sqrt((R * R).sum(0))
+    U, values, V = np.linalg.svd(R / np.where(D > 0.0, D, 1.0), full_matrices=False)
+    known = values > _NOTHING * values.max(initial=0.0)
+    Q, R = np.linalg.qr(values[known, None] * V[known] * D)
+    return np.triu(R), Q.T @ (U[:, known].T @ d)
 
 
 def _value(graph: FactorGraph, v: int) -> F64:

@@ -19,7 +19,7 @@ from factorbus.solver.changes.marginal import reduced
 from factorbus.solver.closures.motions import adjoint_motion, inverse_motion
 from factorbus.solver.errors import Underconstrained
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.quadratic import kind_of, quadratic
+from factorbus.solver.graph.whitened import kind_of, whitened
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.lifelong.relative_terms import RelativeTerm, motion_of, value_of
@@ -56,7 +56,7 @@ def try_eliminate(graph: FactorGraph, poses: list[int], rows: Sequence[int], joi
 
     None: it cannot be told, as no pose is among their neighbours, or several fixed ones, or these are not determined.
     """
-    whole = quadratic(graph, rows, poses)
+    whole = whitened(graph, rows, poses)
     others = whole.variables[len(poses) :]
     fixed = sorted({v for row in rows for v in graph.ends_of(row)} - set(whole.variables))
     ends = [*fixed, *(v for v in others if graph.var[v, at.V_KIND] in (at.SE2, at.SE3))]
@@ -65,7 +65,8 @@ def try_eliminate(graph: FactorGraph, poses: list[int], rows: Sequence[int], joi
     if len(fixed) + len(others) == 1:
         return Eliminated([], 0.0)
     try:
-        information, eta = reduced(graph, whole, len(poses))
+        R, d = reduced(graph, whole, len(poses))
+        information, eta = R.T @ R, R.T @ d
         more = sum(kind_of(graph, v).dim for v in fixed)
         information, eta = np.pad(information, (more, 0)), np.pad(eta, (more, 0))
         starts = {v: whole.starts[v] - whole.starts[others[0]] + more for v in others} | dict.fromkeys(fixed, 0)

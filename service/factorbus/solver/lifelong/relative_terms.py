@@ -6,7 +6,7 @@ import numpy as np
 
 from factorbus.solver.closures.motions import adjoint_motion, inverse_motion, motions_of_poses
 from factorbus.solver.graph.factor_graph import FactorGraph
-from factorbus.solver.graph.quadratic import kind_of, quadratic
+from factorbus.solver.graph.whitened import kind_of, whitened
 from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.rotation_matrices import quaternions_of
@@ -43,7 +43,7 @@ def turned_term(graph: FactorGraph, term: RelativeTerm) -> RelativeTerm:
 
 def term_of_factors(graph: FactorGraph, rows: list[int], i: int, j: int) -> RelativeTerm:
     """What relative factors between pose i and variable j say together."""
-    whole = quadratic(graph, rows, [i, j])
+    whole = whitened(graph, rows, [i, j])
     # With pose i held, y is the increment of j; that of a landmark is along the axes of the map.
     cut, turn = whole.starts[j], _axes_seen_from(graph, i, j)
     return RelativeTerm(i, j, turn @ whole.information[cut:, cut:] @ turn.T, -turn @ whole.eta[cut:])

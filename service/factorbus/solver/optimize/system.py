@@ -15,8 +15,9 @@ from factorbus.solver.kernels.sparse.partial_cholesky import ROUNDING
 from factorbus.solver.optimize.conjugate import ConjugateGradients
 from factorbus.solver.optimize.factor import Factor
 from factorbus.solver.report import Stopwatch
-from factorbus.solver.sparse.anchors import find_loose, find_loose_by_themselves
+from factorbus.solver.sparse.anchors import LOOSE, find_loose, find_loose_by_themselves
 from factorbus.solver.sparse.blocks import HessianBlocks
+from factorbus.solver.sparse.full_rank import have_full_rank
 
 R = TypeVar("R", bound=Factor)
 
@@ -72,21 +73,13 @@ class System(Generic[R]):
             failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
         if failed >= 0:
             failed = self._factorize_rest(failed, damping)
-        if damping == 0.0 and not (self.rounded or self._suspects.size):
+        if damping == 0.0 and self._suspects.size:
+            self._check_suspects(failed)
+            self._suspects = self._suspects[:0]
+        if damping == 0.0 and not self.rounded:
             self.rounded = failed >= 0 or self._has_lost()
             if self.rounded:
                 failed = self._solver.factorize(self.graph, self.blocks, damping, self._watch)
-        if self._suspects.size and damping == 0.0:
-            if failed >= 0:
-                raise self.underconstrained(self.variable_of(failed))
-            loose, suspects = -1, self._suspects
-            if self.rounded:
-                loose, suspects = find_loose_by_themselves(self.graph, self.blocks, suspects)
-            if loose < 0 and suspects.size:
-                loose = find_loose(self.graph, self.blocks, suspects, self._solve)
-            if loose >= 0:
-                raise self.underconstrained(loose)
-            self._suspects = self._suspects[:0]
         return failed
 
     def serve(self) -> bool:
@@ -215,6 +208,18 @@ class System(Generic[R]):
     def _has_lost(self) -> bool:
         """Whether a pivot is no more than the rounding of the largest entry."""
         return self.factor.least_pivot() <= ROUNDING * self.blocks.largest()
+
+    def _check_suspects(self, failed: int) -> None:
+        """Raises Underconstrained where the suspects are free to move; failed: the column of a pivot, or −1."""
+        loose, suspects = -1, self._suspects
+        if failed >= 0:
+            loose = self.variable_of(failed)
+        elif self.rounded:
+            loose, suspects = find_loose_by_themselves(self.graph, self.blocks, suspects)
+        if loose < 0 and suspects.size:
+            loose = find_loose(self.graph, self.blocks, suspects, self._solve)
+        if loose >= 0 and not have_full_rank(self.graph, self._suspects, LOOSE):
+            raise self.underconstrained(loose)
 
     def _may_have_found(self) -> bool:
         """Whether what R had lost may be known well by now, as where positions came after a weak first prior: R of Λ

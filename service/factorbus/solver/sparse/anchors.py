@@ -21,7 +21,7 @@ from factorbus.solver.kernels.model.kinds import ABSOLUTE, OF_FAMILY
 from factorbus.solver.sparse.blocks import HessianBlocks
 
 # A variance this many times what the variable's own factors alone would leave is no longer a number.
-_LOOSE = 1e12
+LOOSE = 1e12
 # Scalars of variables that are looked at together without the rest.
 _TOGETHER = 1000
 # The share of its diagonal that the least known direction of a linear factor has to keep, for it to determine.
@@ -96,7 +96,7 @@ def find_loose(graph: FactorGraph, blocks: HessianBlocks, suspects: I64, solve: 
     np.multiply(scale, signs, out=probe)
     answer = np.abs(scale * solve(probe))
     loosest = int(np.argmax(np.where(np.isfinite(answer), answer, np.inf)))
-    if answer[loosest] <= _LOOSE:
+    if answer[loosest] <= LOOSE:
         return -1
     return int(suspects[np.searchsorted(rows[:, at.V_SCALAR], loosest, side="right") - 1])
 
@@ -105,7 +105,7 @@ def find_loose_by_themselves(graph: FactorGraph, blocks: HessianBlocks, suspects
     """The suspect that is free to move where nothing else moves, or −1; and the suspects of which this does not tell.
 
     All other variables are held without them, so Λ is positive definite where its part of the suspects is: an
-    eigenvalue of that part, normalized, is no more than 1 / `_LOOSE`.  Told where no more than `_TOGETHER` scalars hang
+    eigenvalue of that part, normalized, is no more than 1 / `LOOSE`.  Told where no more than `_TOGETHER` scalars hang
     together.
     """
     place = np.full(int(graph.counts[at.COLUMNS]), -1)
@@ -130,7 +130,7 @@ def find_loose_by_themselves(graph: FactorGraph, blocks: HessianBlocks, suspects
             Lambda[a : a + da, b : b + db], Lambda[b : b + db, a : a + da] = block, block.T
         D = np.sqrt(np.maximum(Lambda.diagonal(), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(Lambda / D / D[:, None])
-        if values[0] <= 1.0 / _LOOSE:
+        if values[0] <= 1.0 / LOOSE:
             loosest = int(np.argmax(np.abs(vectors[:, 0])))
             return int(suspects[members[np.searchsorted(start[members], loosest, side="right") - 1]]), _NONE
     return -1, np.concatenate([_NONE, *untold])
