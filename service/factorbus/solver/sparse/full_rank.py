@@ -21,7 +21,7 @@ def have_full_rank(graph: FactorGraph, variables: I64, loosest: float) -> bool:
     """Whether the factors on these free variables determine them, all others held: (7.1) of JᵀJ, rows of J scaled to
     length 1, then columns, is at most `loosest`, of a normal vector in place of signs: a row with two equal entries
     hides from signs."""
-    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse import coo_array, csc_array, diags_array
     from scipy.sparse.linalg import splu
 
     dims = graph.dims[graph.var[variables, at.V_COLUMN]]
@@ -30,7 +30,9 @@ def have_full_rank(graph: FactorGraph, variables: I64, loosest: float) -> bool:
     rows, columns, numbers, m = list[I64](), list[I64](), list[F64](), 0
     for first_row in _factors_on(graph, start >= 0):
         factor = linearized_factor(graph, first_row)
-        place = np.concatenate([_places(start[v], d) for v, d in zip(factor.ends, factor.dims, strict=True)])
+        place = np.concatenate(
+            [_places(int(start[v]), d) for v, d in zip(factor.ends.tolist(), factor.dims.tolist(), strict=True)]
+        )
         is_linear = graph.fac[first_row, at.F_KIND] == at.LINEAR
         J = _scaled(factor, place >= 0, is_linear)
         rows.append(m + np.repeat(np.arange(len(J)), J.shape[1]))
@@ -43,7 +45,7 @@ def have_full_rank(graph: FactorGraph, variables: I64, loosest: float) -> bool:
         return False
     J = J @ diags_array(1.0 / length)
     try:
-        answer = splu((J.T @ J).tocsc()).solve(np.random.default_rng(1).normal(size=n))
+        answer = splu(csc_array(J.T @ J)).solve(np.random.default_rng(1).normal(size=n))
     except RuntimeError:  # a pivot is zero
         return False
     return bool(np.isfinite(answer).all() and np.abs(answer).max() <= loosest)
