@@ -213,9 +213,10 @@ class TreeSteps:
     def _look_again(self) -> None:
         """What the optimum is at least, by what another step would gain, where raised pivots alone stand against it."""
         tree, share = self._tree, self._options.converged_share
+        if tree.state.item(tl.S_AFTER) != tl.RAISED or tree.state.item(tl.S_CONTINUES):
+            return
         _, chi2, _, error, allowed, *_ = tree.totals.tolist()
-        only_raised = tree.state.item(tl.S_AFTER) == tl.RAISED and not tree.state.item(tl.S_CONTINUES)
-        if only_raised and not tree.behind and error <= allowed and not self._is_within(share, chi2):
+        if not tree.behind and error <= allowed and not self._is_within(share, chi2):
             most = share * self._share
             left = tree.remaining(most)
             if left <= most:

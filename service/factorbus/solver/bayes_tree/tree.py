@@ -96,12 +96,12 @@ class CliqueTree(Arenas):
     @property
     def rises(self) -> bool:
         """Whether the last round of the step raised χ², so that it went no further."""
-        return bool(self.state[tl.S_RISES])
+        return self.state.item(tl.S_RISES) != 0
 
     @property
     def raised(self) -> bool:
         """Whether pivots were raised, so that R alone does not lead to the optimum."""
-        return bool(self.state[tl.S_RAISED])
+        return self.state.item(tl.S_RAISED) != 0
 
     @property
     def deferred(self) -> int:
@@ -111,7 +111,7 @@ class CliqueTree(Arenas):
     @property
     def behind(self) -> bool:
         """Whether back-substitution left a part of the map where it was."""
-        return bool(self.state[tl.S_BEHIND])
+        return self.state.item(tl.S_BEHIND) != 0
 
     @property
     def failed(self) -> int:
