@@ -6,8 +6,8 @@
 #     deploy/setup/try-aarch64.sh /var/tmp/arm -m factorbus.cli replay intel.g2o --in-process --json
 #     deploy/setup/try-aarch64.sh /var/tmp/arm -m pytest -p no:cacheprovider tests/solver/test_cholesky_kernels.py
 #
-# Wanted: Debian's debootstrap and qemu-user-static, as root.  All kernels take some 20 minutes to compile, a step a thousand
-# times as long as on the machine itself.  No process starts another one: an emulated one could not.
+# Wanted: Debian's debootstrap and qemu-user-static, as root.  All kernels take some 20 minutes to compile, tests ten to
+# sixty times as long as on the machine itself; FACTORBUS_EXAMPLES=2 tries properties at two examples each.
 set -euo pipefail
 
 main() {
@@ -23,9 +23,17 @@ main() {
     [ -e "$folder/system/.ready" ] || system "$folder"
     [ -e "$folder/packages/.ready" ] || packages "$folder" "$here"
     export QEMU_CPU=${QEMU_CPU:-cortex-a72} HOME=$folder/home FACTORBUS_CACHE=$folder/kernels PYTHONDONTWRITEBYTECODE=1
-    export PYTHONPATH=$here/proto:$here/service:$here/workers:$here/clients:$folder/packages
+    export PYTHONPATH=$here/proto:$here/service:$here/workers:$here/clients:$folder/packages:$folder
     cd "$here"
-    qemu-aarch64-static -L "$folder/system" "$folder/system/usr/bin/python3.11" "$@"
+    start "$folder"
+    "$folder/python" "$@"
+}
+
+# What runs Python, also where Python is to start another one: the system itself cannot execute that file.
+start() {
+    printf '#!/usr/bin/env bash\nexec qemu-aarch64-static -L "%s/system" "%s/system/usr/bin/python3.11" "$@"\n' "$1" "$1" > "$1/python"
+    chmod +x "$1/python"
+    printf 'import sys\n\nsys.executable = "%s/python"\n' "$1" > "$1/sitecustomize.py"
 }
 
 # The first stage of debootstrap unpacks what every system has; what else it has fetched is unpacked here.
@@ -49,8 +57,9 @@ import sys, tomllib
 with open(sys.argv[1], "rb") as file:
     project = tomllib.load(file)["project"]
 extras = project["optional-dependencies"]
-tests = ("hypothesis", "pytest>", "pytest-timeout")
-print(*project["dependencies"], *extras["service"], *(each for each in extras["dev"] if each.startswith(tests)), sep="\n")
+tests = ("gtsam", "hypothesis", "pytest>", "pytest-timeout")
+wanted = [each for each in [*extras["dev"], *extras["bench"]] if each.startswith(tests)]
+print(*project["dependencies"], *extras["service"], *wanted, sep="\n")
 EOF
     )
     for platform in manylinux_2_28 manylinux_2_27 manylinux_2_17 manylinux2014 manylinux_2_5; do
