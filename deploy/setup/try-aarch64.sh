@@ -23,17 +23,18 @@ main() {
     [ -e "$folder/system/.ready" ] || system "$folder"
     [ -e "$folder/packages/.ready" ] || packages "$folder" "$here"
     export QEMU_CPU=${QEMU_CPU:-cortex-a72} HOME=$folder/home FACTORBUS_CACHE=$folder/kernels PYTHONDONTWRITEBYTECODE=1
-    export PYTHONPATH=$here/proto:$here/service:$here/workers:$here/clients:$folder/packages:$folder
     cd "$here"
-    start "$folder"
+    start "$folder" "$here"
     "$folder/python" "$@"
 }
 
-# What runs Python, also where Python is to start another one: the system itself cannot execute that file.
+# What runs Python, also where Python is to start another one, as the system itself cannot execute that file; and where
+# each of them finds the packages and this clone.
 start() {
+    local found=$1/system/usr/lib/python3/dist-packages
     printf '#!/usr/bin/env bash\nexec qemu-aarch64-static -L "%s/system" "%s/system/usr/bin/python3.11" "$@"\n' "$1" "$1" > "$1/python"
     chmod +x "$1/python"
-    printf 'import sys\n\nsys.executable = "%s/python"\n' "$1" > "$1/sitecustomize.py"
+    printf '%s\n' "$1/packages" "$2"/{proto,service,workers,clients} "import sys; sys.executable = '$1/python'" > "$found/clone.pth"
 }
 
 # The first stage of debootstrap unpacks what every system has; what else it has fetched is unpacked here.
