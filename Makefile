@@ -32,7 +32,7 @@ demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as
 	@$(BIN)/factorbus demo $(ARGS)
 
 live: $(READY) ## a graph file of yours, FILE=my.g2o, as a live map in the browser
-	@$(BIN)/factorbus replay $(FILE) --live $(ARGS)
+	@$(BIN)/factorbus replay $(if $(FILE),"$(FILE:~/%=$(HOME)/%)") --live $(ARGS)
 
 # Side by side, the tests of one file in one process, which share what it has started, the longest files first; then, one by one, those that want
 # the machine to themselves.  `tests/test_side_by_side.py` holds that each runs in one of the two.

@@ -67,6 +67,13 @@ def test_what_others_can_write_to_is_not(folder: Path, mode: int, who: str) -> N
         assert (raised.value.code, raised.value.detail["folder"]) == ("unsafe_folder", str(folder))
 
 
+def test_the_command_that_mends_a_folder_can_be_pasted(folder: Path) -> None:
+    spaced = folder / "my maps"
+    spaced.mkdir()
+    spaced.chmod(0o777)
+    assert why_unsafe(spaced)[1].startswith(f"chmod go-w '{spaced}'")
+
+
 def test_what_belongs_to_another_is_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     give_away(folder, monkeypatch)
     with pytest.raises(UnsafeFolder, match="it belongs to user"):

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -103,3 +104,21 @@ def test_units_call_commands_that_exist_with_options_they_have(unit: str, capsys
         assert main([command, "--help"]) == 0
         shown = capsys.readouterr().out
         assert all(option in shown for option in re.findall(r"--[a-z-]+", options))
+
+
+@pytest.mark.parametrize(
+    ("told", "driven"),
+    [
+        (["FILE=my town.g2o"], ["replay", "my town.g2o", "--live"]),
+        (["FILE=~/town.g2o"], ["replay", "/home/somebody/town.g2o", "--live"]),
+        (["FILE=town.g2o", "ARGS=--pace 10"], ["replay", "town.g2o", "--live", "--pace", "10"]),
+        ([], ["replay", "--live"]),
+    ],
+    ids=["space", "home", "options", "none"],
+)
+def test_make_live_takes_any_path(told: list[str], driven: list[str]) -> None:
+    ran = subprocess.run(
+        ["make", "--dry-run", "--assume-old=.venv/.ready", "live", *told],
+        cwd=ROOT, env=os.environ | {"HOME": "/home/somebody"}, capture_output=True, text=True, timeout=30, check=True,
+    )  # fmt: skip
+    assert shlex.split(ran.stdout.splitlines()[-1])[1:] == driven

@@ -63,6 +63,8 @@ def test_version_names_the_libraries() -> None:
     [
         (["frobnicate"], USAGE, "there is no command 'frobnicate'; factorbus --help lists"),
         (["stat"], USAGE, "there is no command 'stat'; did you mean 'stats'?"),
+        (["ask", "yard"], USAGE, "The commands of `factorbus ask` are: chi2, components, covariance, "),
+        (["plot", "one.g2o"], USAGE, "sparsity, tree. The name of a map or file comes behind one of them"),
         (["replay"], USAGE, "Missing argument 'FILE'"),
         (["replay", "a.g2o", "--in-process", "--connect", "tcp/127.0.0.1:1"], USAGE, "exclude each other"),
         (["replay", "a.g2o", "--out", "nowhere/b.g2o"], USAGE, "there is no folder nowhere; make it first"),

@@ -179,7 +179,8 @@ def test_a_name_that_is_too_long_is_named(arguments: tuple[str, ...]) -> None:
 def test_a_graph_without_values_says_what_has_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = tmp_path / "town.g2o"
     source.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
-    assert main(["convert", str(source), str(tmp_path / "town.tum")]) == BAD_FILE
-    assert "solve it first, as `factorbus replay FILE --tum OUT` does" in capsys.readouterr().err
+    for form in ("tum", "kitti"):
+        assert main(["convert", str(source), str(tmp_path / f"town.{form}")]) == BAD_FILE
+        assert f"solve it first, as `factorbus replay FILE --{form} OUT` does" in capsys.readouterr().err
     assert main(["replay", str(source), "--in-process"]) == OK
     assert re.search(r"^ *fixed +x0 *$", capsys.readouterr().out, re.M)

@@ -206,6 +206,17 @@ def test_an_import_over_a_map_that_is_there_says_so(tmp_path: Path, capsys: pyte
     assert "[map_exists]" in said
 
 
+def test_an_import_of_a_file_that_no_map_can_be_named_after_says_how_it_gets_a_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, named_otherwise = tmp_path / "hall.fbmap", tmp_path / "my hall.fbmap"
+    code = main(["import", str(good), str(named_otherwise), "--journal", str(tmp_path)])
+    said = " ".join(capsys.readouterr().err.split())
+    assert code == USAGE, said
+    assert "my hall.fbmap has a name that no map can have; wanted a name of 1 to 64 of the characters" in said
+    assert said.endswith("--as MAP gives it one")
+
+
 def test_files_of_the_folder_one_is_in_are_neither_run_nor_in_the_way(tmp_path: Path) -> None:
     for name in (
         "click",

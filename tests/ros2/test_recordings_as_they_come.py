@@ -167,6 +167,9 @@ def test_commands_about_graphs_say_how_a_recording_becomes_one(
     assert main(["convert", "drive.mcap", str(tmp_path / "out.g2o")]) == BAD_FILE
     told = " ".join(capsys.readouterr().err.split())
     assert "a robot's recording; wanted a graph: factorbus replay drive.mcap --in-process --out map.g2o" in told
+    (path.parent / "my drive.mcap").symlink_to(path)
+    assert main(["convert", "my drive.mcap", str(tmp_path / "out.g2o")]) == BAD_FILE
+    assert "factorbus replay 'my drive.mcap' --in-process" in " ".join(capsys.readouterr().err.split())
     assert main(["plot", "map", "drive.mcap", "--out", str(tmp_path / "map.png")]) == BAD_FILE
     assert "a robot's recording" in capsys.readouterr().err
 

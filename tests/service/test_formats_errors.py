@@ -1,8 +1,11 @@
 """Every way in which a file is wrong names the file, the line, what stands there and what was wanted."""
 
+import bz2
 import gzip
+import lzma
 import os
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -144,6 +147,40 @@ def test_damaged_gzip(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(FormatError, match="cannot be read"):
             read(path)
+
+
+def test_gzip_that_unpacks_to_very_much_more_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "blank.g2o.gz"
+    path.write_bytes(gzip.compress(GOOD.encode() + b"\n" * 70_000_000, compresslevel=9))
+    with pytest.raises(FormatError, match=r"blank\.g2o\.gz: gzip that unpacks to more than 200 times its"):
+        read(path)
+
+
+def test_blank_lines_take_no_time_and_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "blank.g2o"
+    path.write_bytes(b" \n" + GOOD.encode() + b"\n \r\n" * 5_000_000 + b"  HELLO 1\n\n")
+    begun = time.process_time()
+    with pytest.raises(FormatError, match=r"blank\.g2o:10000003: HELLO"):
+        read(path, strict=True)
+    assert time.process_time() - begun < 3  # line by line 10 s
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (bz2.compress(GOOD.encode() * 50), "packed by bzip2; .*bunzip2"),
+        (lzma.compress(GOOD.encode() * 50), "packed by xz; .*unxz"),
+        (GOOD.encode("utf-16"), "text in UTF-16; .*iconv"),
+        (b"PK\x03\x04\x14\x00", "a zip archive; .*unzip"),
+        (b"\x00BZh", ":1: a zero byte"),
+    ],
+    ids=["bzip2", "xz", "UTF-16", "zip", "neither"],
+)
+def test_what_is_no_text_says_what_it_is(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "packed.g2o"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match=said):
+        read(path)
 
 
 def test_unknown_dialect(tmp_path: Path) -> None:

@@ -136,6 +136,21 @@ def test_nothing_to_see_and_nothing_to_choose_from() -> None:
     ]
 
 
+@pytest.mark.parametrize("choices", [0, 1])
+def test_observations_of_no_landmark_take_no_part_in_the_search(choices: int) -> None:
+    solver, points = room(8.0, 0.05)
+    x, y, t = next(values[0] for keys, values in ((g.keys, g.values) for g in solver.estimate()) if keys[0] == 1)
+    turn = np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]])
+    n, right = 100_000, 70_001  # a matrix of all of them would have 320 GB
+    seen = np.full((n, 2), 40.0)
+    seen[right] = (points[5] - [x, y]) @ turn.T
+    blocks = CovarianceBlocks(solver.covariances.factored())
+    landmarks = np.arange(7, 7 + choices)
+    found = associate(blocks, "landmark_se2", 1, seen, np.tile([400.0, 0, 400.0], (n, 1)), landmarks, 0.95)
+    assert np.flatnonzero(found.landmark >= 0).tolist() == [right] * choices
+    assert found.landmark[right] == (7 if choices else -1)
+
+
 def test_what_cannot_be_is_refused() -> None:
     blocks, weight = CovarianceBlocks(room(8.0, 0.05)[0].covariances.factored()), np.array([[1.0, 0, 1.0]])
     with pytest.raises(errors.KindMismatch):

@@ -6,7 +6,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from bare import Bare, bare, edge, keys_of, pose, start
+from bare import PATIENCE_S, Bare, bare, edge, keys_of, pose, start
 
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import Batch, Factors, Insert, Variables
@@ -143,7 +143,11 @@ def test_a_bad_message_uses_its_number_up(client: Bare) -> None:
         (keys.insert_key("nowhere", "a"), "unknown_map"),
         (keys.ask_key("nowhere", "estimate"), "unknown_map"),
         (keys.ask_key("refusals", "weather"), "unknown_question"),
+        (keys.ask_key("refusals", "estimate/x"), "unknown_question"),
+        (keys.ask_key("nowhere", "estimate/x/y"), "unknown_map"),
+        (keys.admin_key("maps/x"), "unknown_question"),
         (f"{keys.PREFIX}/map/refusals/in/a.b", "bad_name"),
+        (f"{keys.PREFIX}/map/refusals/in/good/x", "bad_name"),
         (f"{keys.PREFIX}/map/refusals/in/*", "bad_name"),
     ],
 )
@@ -151,6 +155,15 @@ def test_what_is_not_there_says_so(client: Bare, key: str, code: str) -> None:
     refused = client.ask(key, GOOD if "/in/" in key else b"")
     assert isinstance(refused, Refused)
     assert refused.code == code
+
+
+@pytest.mark.parametrize("pattern", ["factorbus/**", f"{keys.PREFIX}/**", f"{keys.PREFIX}/map/**"])
+def test_who_asks_a_pattern_is_refused_for_each_key_that_it_meets(client: Bare, pattern: str) -> None:
+    waiting, codes = client.send(pattern, GOOD), set()
+    while (came := waiting.get(timeout=PATIENCE_S)) is not None:
+        assert isinstance(came, Refused)
+        codes.add(came.code)
+    assert {"bad_name", "unknown_map"} <= codes  # of in/*, ask/* and records/*
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         error.show()
         if as_json:
             document({"problem": {"code": "bad_usage", "message": error.format_message(), "detail": {}}})
-        if isinstance(error, click.NoSuchOption) and (hint := _hint(error)):
+        if hint := _hint(error):
             click.echo(hint, err=True)
         return USAGE
     except (KeyboardInterrupt, click.Abort):
@@ -132,8 +132,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return report(error, as_json=as_json, debug=debug)
 
 
-def _hint(error: click.NoSuchOption) -> str:
-    """What was meant, where more is to be said than the names of near options."""
+def _hint(error: click.ClickException) -> str:
+    """What was meant, where more is to be said than the names of near options and commands."""
+    ctx = error.ctx if isinstance(error, click.UsageError) else None
+    if ctx and ctx.parent and isinstance(ctx.command, click.Group) and "No such command" in error.message:
+        there = ", ".join(ctx.command.list_commands(ctx))
+        return f"The commands of `{ctx.command_path}` are: {there}. The name of a map or file comes behind one of them"
+    if not isinstance(error, click.NoSuchOption):
+        return ""
     if re.fullmatch(r"-[0-9.]", error.option_name):
         return "A number below 0 is written behind `--`, and options before that: NAME -- -1"
     if "topic" in error.option_name and error.ctx and error.ctx.info_name in ("replay", "ros2"):

@@ -17,6 +17,7 @@ users apart (Windows) everything is safe.
 """
 
 import os
+import shlex
 import stat
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,7 @@ def why_unsafe_itself(path: Path, status: os.stat_result, groups: set[int]) -> t
     given = status.st_uid == _ROOT and status.st_gid in groups
     if mode & stat.S_IWOTH or (mode & stat.S_IWGRP and not given):
         who = "everybody" if mode & stat.S_IWOTH else f"group {status.st_gid}"
-        return f"{who} can write to it (mode {mode:04o})", f"chmod go-w {path}, or name another folder"
+        return f"{who} can write to it (mode {mode:04o})", f"chmod go-w {_quoted(path)}, or name another folder"
     return "", ""
 
 
@@ -108,11 +109,19 @@ def _why_unsafe_above(path: Path, above: Path, status: os.stat_result) -> tuple[
     if status.st_mode & stat.S_ISVTX or os.path.ismount(above):
         return "", ""
     if status.st_mode & stat.S_IWOTH:
-        return f"it is in {above}, which everybody can write to", f"chmod o-w {above}, or name a folder elsewhere"
+        return (
+            f"it is in {above}, which everybody can write to",
+            f"chmod o-w {_quoted(above)}, or name a folder elsewhere",
+        )
     if foreign:
         who = f"it is in {above}, which group {status.st_gid} can write to"
-        return who, f"chmod g-w {above}, or name a folder elsewhere"
+        return who, f"chmod g-w {_quoted(above)}, or name a folder elsewhere"
     return "", ""
+
+
+def _quoted(path: Path) -> str:
+    """As a shell takes it."""
+    return shlex.quote(str(path))
 
 
 def _is_read_only(path: Path) -> bool:

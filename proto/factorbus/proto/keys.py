@@ -73,6 +73,12 @@ def any_question(map_name: str) -> str:
     return f"{map_root(map_name)}/ask/*"
 
 
+def below_map(key: str) -> tuple[str, str]:
+    """(map, what stands behind in/, ask/ or records/) of a key or pattern, such as `factorbus/**`."""
+    parts = key.split("/")
+    return parts[min(3, len(parts) - 1)], "/".join(parts[5:]) or parts[-1]
+
+
 def records_key(map_name: str, replica: str) -> str:
     """Where `replica` sends the records of its journal.  Raises BadName."""
     return f"{map_root(map_name)}/records/{checked_name('replica', replica)}"

@@ -1,6 +1,7 @@
 """From a file to its lines, in buckets by the name of the record."""
 
 import gzip
+import io
 import re
 import zlib
 from dataclasses import dataclass, field
@@ -11,6 +12,20 @@ from factorbus.wording.unreadable import is_device, mend_of
 
 # Behind a point and before one of these it is a number that is none, as Microsoft's compilers have printed them.
 _COMMENT = re.compile(rb"(?<!\.)#|#(?!INF|IND|QNAN|SNAN)")
+# From the first character of a line to its end; what is blank in between is passed over at once.
+_LINE = re.compile(rb"\S[^\n]*")
+# How a file begins that is not the text itself, what it is then, and what makes text of it.
+_OTHERWISE = {
+    b"BZh": ("packed by bzip2", "bunzip2"),
+    b"\xfd7zXZ\x00": ("packed by xz", "unxz"),
+    b"\x28\xb5\x2f\xfd": ("packed by zstd", "unzstd"),
+    b"PK\x03\x04": ("a zip archive", "unzip"),
+    b"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z x"),
+    b"\xff\xfe": ("text in UTF-16", "iconv -f UTF-16 -t UTF-8"),
+    b"\xfe\xff": ("text in UTF-16", "iconv -f UTF-16 -t UTF-8"),
+}
+# Graphs are packed to a third or a twentieth.  A file of some kilobytes could else unpack to all the memory there is.
+_MOST_UNPACKED, _MOST_TIMES = 1 << 26, 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +43,18 @@ def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
     Raises FormatError when it is not text or has no record.
     """
     if b"\0" in content:
-        line = content[: content.index(b"\0")].count(b"\n") + 1
+        for begins, (seen, mend) in _OTHERWISE.items():
+            if content.startswith(begins):
+                raise FormatError(file, None, seen, f"a text file in ASCII or UTF-8, plain or gzipped: {mend}")
+        line = content.count(b"\n", 0, content.index(b"\0")) + 1
         raise FormatError(file, line, "a zero byte", "a text file in ASCII or UTF-8")
     found: dict[bytes, Bucket] = {}
-    for number, line in enumerate(content.split(b"\n"), 1):
-        name, *rest = _uncommented(line).split(None, 1) or (b"",)
+    number, end = 1, -2
+    for match in _LINE.finditer(content):
+        start = match.start()
+        number += 1 if start == end + 1 else content.count(b"\n", max(end, 0), start)
+        end = match.end()
+        name, *rest = _uncommented(match[0]).split(None, 1) or (b"",)
         if not name:
             continue
         bucket = found.get(name)
@@ -58,7 +80,7 @@ def read_content(path: Path) -> bytes:
             raise FormatError(str(path), None, "a device", "a file, or a pipe such as /dev/stdin behind one")
         content = path.read_bytes()
         if content.startswith(b"\x1f\x8b"):
-            content = gzip.decompress(content)
+            content = _unpacked(path, content)
     except (OSError, EOFError, zlib.error) as failure:  # gzip reports a damaged file in these three ways
         reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else str(failure)
         mend = "; " + mend_of(failure) if isinstance(failure, OSError) and failure.errno else ""
@@ -67,3 +89,13 @@ def read_content(path: Path) -> bytes:
         wanted = f"a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file{mend}"
         raise FormatError(str(path), None, f"it cannot be read ({reason})", wanted) from failure
     return content.removeprefix(b"\xef\xbb\xbf")
+
+
+def _unpacked(path: Path, packed: bytes) -> bytes:
+    """Raises FormatError, and what gzip raises."""
+    most = max(_MOST_UNPACKED, _MOST_TIMES * len(packed))
+    content = gzip.GzipFile(fileobj=io.BytesIO(packed)).read(most + 1)
+    if len(content) > most:
+        seen = f"gzip that unpacks to more than {_MOST_TIMES} times its size ({len(packed):,})"
+        raise FormatError(str(path), None, seen, "a graph, or the file unpacked (gunzip)")
+    return content

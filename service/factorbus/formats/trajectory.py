@@ -17,7 +17,7 @@ from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol, symbol_parts
 from factorbus.wording import counted
 
-_VALUED = "a value for every pose: solve it first, as `factorbus replay FILE --tum OUT` does"
+_VALUED = "a value for every pose: solve it first, as `factorbus replay FILE --{option} OUT` does"
 
 
 class Stamped(NamedTuple):
@@ -42,7 +42,8 @@ def trajectories(batch: Batch, form: str) -> dict[str, list[Stamped]]:
     for group in batch.variables:
         if group.kind in ("se2", "se3"):
             if group.values is None:
-                raise FormatError(form, None, f"{format_symbol(int(group.keys[0]))} has no value", _VALUED)
+                wanted = _VALUED.format(option=form.lower())
+                raise FormatError(form, None, f"{format_symbol(int(group.keys[0]))} has no value", wanted)
             lift = _lifted if group.kind == "se2" else list
             rows = zip(group.keys.tolist(), _stamps(group).tolist(), group.values.tolist(), strict=True)
             for key, stamp, value in rows:

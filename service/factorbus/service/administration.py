@@ -5,7 +5,7 @@ import secrets
 from collections.abc import Callable
 from typing import Any
 
-from factorbus.proto import codec
+from factorbus.proto import codec, keys
 from factorbus.proto.problems import Internal, Problem, UnknownQuestion
 from factorbus.proto.protocol import known
 from factorbus.proto.version import __version__
@@ -30,7 +30,7 @@ class Administration:
 
     def answer(self, query: Asker) -> None:
         """Answer what `query` asks, at once or when it is done; leave it to others where it is theirs."""
-        operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)
+        operation, payload = str(query.key_expr).removeprefix(keys.admin_key("")), payload_of(query)
         try:
             if operation in ("maps", "stats"):
                 self._maps.open_new()

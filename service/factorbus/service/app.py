@@ -73,6 +73,7 @@ log = logging.getLogger(__name__)
 _TICK_S = 0.25
 _ADMIN_WAITING = 1024
 _TOKEN_S = 10.0
+_LONGER = "*/*/**"  # two chunks or more
 _FIRST = 1  # the number that is wanted of a client that is not known
 
 
@@ -191,6 +192,10 @@ class Shell:
         bus.answer_on(f"{root}/ask/*", self._on_question)
         bus.answer_on(f"{root}/records/*", self._on_records)
         bus.answer_on(keys.admin_key("*"), self._on_admin)
+        # Too many chunks, as in ask/estimate/x, are refused as well, and not met with silence.
+        bus.answer_on(f"{root}/in/{_LONGER}", self._on_insert)
+        bus.answer_on(f"{root}/ask/{_LONGER}", self._on_question)
+        bus.answer_on(keys.admin_key(_LONGER), self._on_admin)
         bus.answer_on(keys.features_key(self._service), self._on_features)
         bus.watch(keys.any_worker_token(), self._on_worker)
         self._metrics = open_metrics(config.metrics, self.health_report)
@@ -253,7 +258,7 @@ class Shell:
         found.host.insert(read)
 
     def _on_question(self, query: Asker) -> None:
-        name, question = _chunks(query)
+        name, question = keys.below_map(key_of(query))
         found = self.maps.get(name)
         if found is None:
             self._delivery.refusals.hand(self._no_map, query, name, self._on_question)
@@ -263,7 +268,7 @@ class Shell:
             found.host.ask(ArrivedQuestion(query, question, payload_of(query)))
 
     def _on_records(self, query: Asker) -> None:
-        name, _ = _chunks(query)
+        name, _ = keys.below_map(key_of(query))
         found = self.maps.get(name)
         if found is None:
             self._delivery.refusals.hand(self._no_map, query, name, self._on_records)
@@ -360,9 +365,3 @@ def _follow(config: Config, service: str, maps: Maps) -> Replicas:
         return open_upstream_bus(config.upstream, config.upstream_zenoh, see)
 
     return Replicas(config.upstream, service, maps.hosts, open_session)
-
-
-def _chunks(query: Asker) -> tuple[str, str]:
-    """(map, last chunk) of a key below map/<map>/."""
-    parts = key_of(query).split("/")
-    return parts[3], parts[-1]

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from factorbus.cli.process.options import journal_option, json_option
-from factorbus.proto.keys import checked_name
+from factorbus.proto.keys import LONGEST_NAME, checked_name, is_name
 
 
 @click.command()
@@ -30,6 +30,10 @@ def command(files: tuple[Path, ...], folder: Path, name: str | None, as_json: bo
 
     if name and len(files) > 1:
         raise click.UsageError("--as is for one FILE")
+    for file in files:
+        if not (name or is_name(file.stem)):
+            wanted = f"a name of 1 to {LONGEST_NAME} of the characters A-Z a-z 0-9 _ -"
+            raise click.UsageError(f"{file} has a name that no map can have; wanted {wanted}: --as MAP gives it one")
     rows = []
     for file, chosen in [(file, checked_name("map", name or file.stem)) for file in files]:
         import_map(file, folder / chosen)

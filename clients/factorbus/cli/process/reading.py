@@ -1,5 +1,6 @@
 """Graph files as commands read them: the options, and one place where what was left out is said."""
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -64,7 +65,7 @@ def read_graph(path: Path, dialect: str | None = None, strict: bool = False, who
     from factorbus.formats import read
 
     if dialect is None and is_recording(path):
-        advice = f"factorbus replay {path} --in-process --out map.g2o makes one of it"
+        advice = f"factorbus replay {shlex.quote(str(path))} --in-process --out map.g2o makes one of it"
         raise Stopped("bad_file", f"{path}: a robot's recording; wanted a graph: {advice}", BAD_FILE, path=str(path))
 
     graph = read(path, dialect, strict, whole)

@@ -47,5 +47,5 @@ class Senders:
 
 
 def _taken_apart(key: str) -> tuple[str, str]:
-    parts = key.split("/")
-    return keys.checked_name("map", parts[3]), keys.checked_name("client", parts[-1])
+    name, client = keys.below_map(key)
+    return keys.checked_name("map", name), keys.checked_name("client", client)

@@ -66,10 +66,12 @@ def associate(
     weigh(np.unique(np.append(landmarks[columns], pose)), dim * observations.size)
     chosen = observations * L + columns
     pairs = FactorGroup(kind, every.keys[chosen], every.measured[chosen], every.information[chosen])
-    begin = np.searchsorted(observations, np.arange(n + 1))
+    # The search takes (observations)² numbers: those of no landmark that there is are none of it.
+    some, first = np.unique(observations, return_index=True)
+    begin = np.append(first, observations.size)
     best, joint, complete = _search(blocks, pairs, begin, columns, probability)
     landmark = np.full(n, -1)
-    landmark[best >= 0] = landmarks[columns[best[best >= 0]]]
+    landmark[some[best >= 0]] = landmarks[columns[best[best >= 0]]]
     dims = dim * int((best >= 0).sum())
     return Association(
         landmark, joint, dims, complete, observations, landmarks[columns], distance[observations, columns]
