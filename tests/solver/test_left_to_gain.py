@@ -8,6 +8,7 @@ from solver.test_converged import put
 
 from factorbus.client import Changes, Draft
 from factorbus.solver import Options, Solver
+from factorbus.solver.bayes_tree import steps
 from factorbus.solver.bayes_tree.left_to_gain import judge_batch
 from factorbus.solver.changing import with_changes
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -100,3 +101,21 @@ def test_it_does_not_rest_where_a_whole_step_would_gain_much() -> None:
     judge_batch(tree, result, SHARE, 0.0)
     assert not result.converged
     assert tree.totals[tl.T_LEAST] == 0.0
+
+
+def test_where_damped_steps_hardly_gain_the_next_ones_begin_without_damping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map of ranges stayed at χ² 352 for hundreds of steps, in which damping went from 40 to 800 and back; without it
+    67 was reached."""
+    tried = list[float]()
+
+    def hardly(_: object, chi2: float, damping: float, *__: object) -> Minimization:
+        tried.append(damping)
+        return Minimization(chi2, 100.0)
+
+    solver = Solver()
+    put(solver, between_two(1.7))
+    monkeypatch.setattr(steps, "minimize", hardly)
+    monkeypatch.setattr(steps.TreeSteps, "_stalls", True)
+    for _ in range(5):
+        solver.step()
+    assert tried == [0.0, 100.0, 0.0, 100.0, 0.0]

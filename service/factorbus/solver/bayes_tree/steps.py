@@ -41,6 +41,8 @@ _COUNTS = tl.S_CYCLES - tl.S_REPORT_BEGIN
 # What back-substitution left undone, below which there is no need to go on, as a share of χ²: by the bound (9.17), some
 # hundred times what it comes to.
 _FINISHED_LEFT = 1e-7
+# Of χ²: a step with nothing new that gains less with damping takes the wrong way.
+_HARDLY = 1e-4
 _NO_BUDGET = (0, 0.0, 0.0, 0.0, True)
 _new = tuple.__new__
 
@@ -262,8 +264,10 @@ class TreeSteps:
             result = self._batch(before, settle, continues, taken_back)
             because = why_batch(settle, escaped, bool(worse), bool(rises), opened, bool(goes_on))
             if result:
-                self._damping = 0.0 if result.converged else result.damping
                 last = chi2_before - tree.totals.item(tl.T_CHI2) if continues else math.inf
+                # Where what went on with damping hardly gained the next one begins without, as one that settles does.
+                anew = result.converged or (self._damping > 0.0 and last <= _HARDLY * self._share)
+                self._damping = 0.0 if anew else result.damping
                 judge_batch(tree, result, self._options.converged_share, last)
                 tree.totals[tl.T_WHOLE], tree.state[tl.S_AFTER] = tree.totals[tl.T_CHI2], 0
             # The tree's own step followed, and what it was before is that of the step.
