@@ -11,6 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from factorbus.solver import errors
+from factorbus.solver.bayes_tree.left_to_gain import AT_END, is_left, judge_batch, unsolved
+from factorbus.solver.bayes_tree.reasons import why_batch, why_tree
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.graph.escaped import find_beyond
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
@@ -36,19 +38,11 @@ from factorbus.wording import counted
 _START: Mark = (0,) * at.COUNTS
 _ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
 _COUNTS = tl.S_CYCLES - tl.S_REPORT_BEGIN
-_NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
 # What back-substitution left undone, below which there is no need to go on, as a share of χ²: by the bound (9.17), some
 # hundred times what it comes to.
 _FINISHED_LEFT = 1e-7
-# By what share of χ² a step of Levenberg-Marquardt may lower it that is the last one, where pivots were raised.
-_AT_END = 1e-7
-_ASKED = "asked to settle"
-_CORRECTED = "residuals taken anew in a chord step"
-_WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
-_ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
-_GOES_ON = "pivots were raised above rounding: conjugate gradients to the optimum"
-_WITHIN = "numbers would have left their bounds: Levenberg-Marquardt within them"
-_STALLS = "a step with nothing new did not lower χ²: Levenberg-Marquardt to the optimum"
+# Of χ²: a step with nothing new that gains less with damping takes the wrong way.
+_HARDLY = 1e-4
 _NO_BUDGET = (0, 0.0, 0.0, 0.0, True)
 _new = tuple.__new__
 
@@ -56,12 +50,12 @@ _new = tuple.__new__
 class TreeSteps:
     """Solves for what is new in a graph, step by step."""
 
-    NOT_KEPT = ("_graph", "_options", "before_batch", "within")
+    NOT_KEPT = ("_graph", "_options", "_resumes", "before_batch", "within")
 
     def __init__(self, graph: FactorGraph, options: Options) -> None:
         self._graph, self._options = graph, options
         self._tree = CliqueTree(graph, options)
-        self._mark, self.within = graph.mark(), False
+        self._mark, self.within, self._resumes = graph.mark(), False, False
         self._first_new, self._batched, self._at_linearization = 0, False, False
         self._damping = 0.0  # with which a batch ended that had not converged: the next one goes on from it
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
@@ -83,6 +77,8 @@ class TreeSteps:
         started = clock() if clock else 0.0
         tree, because = self._tree, ""
         bounded = not settle and 0.0 < budget <= MOST_BUDGET and (always or self._has_new)
+        # What takes over a graph has it all in hands, and what was found to be left is looked for until it is not.
+        looks = not bounded and (self._resumes or tree.totals.item(tl.T_EXCESS) > 0.0)
         if bounded:
             tree.set_budget(budget)
         try:
@@ -103,9 +99,9 @@ class TreeSteps:
         compiled = clock() if clock else 0.0
         self._at_linearization = False
         if not bounded:
-            self._look_again()
+            self._look_again(looks)
         escaped = self._has_escaped
-        stands = not tree.state.item(tl.S_AFTER) and (bounded or not self._stalls)
+        stands = not tree.state.item(tl.S_AFTER) and (bounded or not (self._is_open or self._stalls))
         if not settle and not escaped and (stands or (bounded and self._is_tolerable)):
             self._damping = 0.0
             return self._report(started, compiled, None, because, budget if bounded else 0.0)
@@ -115,7 +111,11 @@ class TreeSteps:
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
         with self._tree.placing_none():
-            return self.step(settle)
+            self._resumes = True
+            try:
+                return self.step(settle)
+            finally:
+                self._resumes = False
 
     def restore(self, report: StepReport) -> None:
         """Put the values from before the last step, which gave `report`, back into the graph."""
@@ -159,8 +159,9 @@ class TreeSteps:
         if self._tree.behind:
             return True
         if self._at_linearization or self._tree.raised:
-            return not self._is_within(_AT_END, chi2)
-        return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
+            return not self._is_within(AT_END, chi2)
+        open_still = self._tree.totals.item(tl.T_EXCESS) > 0.0
+        return open_still or error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
 
     @property
     def complete(self) -> bool:
@@ -179,6 +180,12 @@ class TreeSteps:
             return False
         least = FINISHED * self._share
         return self._gained < -least or (self._gained <= least and self.unfinished)
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether forces leave more than is called converged after a step with all in hands, or with nothing new."""
+        has_all = self._resumes or self._tree.state.item(tl.S_CONTINUES) != 0
+        return has_all and self._tree.totals.item(tl.T_EXCESS) > 0.0
 
     @property
     def _is_tolerable(self) -> bool:
@@ -210,17 +217,19 @@ class TreeSteps:
         """Σ rᵀ Ω r at the estimate, as of the last step, summed anew."""
         return self._sum_chi2(self._mark[at.FACTORS])
 
-    def _look_again(self) -> None:
-        """What the optimum is at least, by what another step would gain, where raised pivots alone stand against it."""
+    def _look_again(self, looks: bool) -> None:
+        """What another step would gain, where raised pivots alone stand against it; with `looks` anyhow."""
         tree, share = self._tree, self._options.converged_share
-        if tree.state.item(tl.S_AFTER) != tl.RAISED or tree.state.item(tl.S_CONTINUES):
-            return
-        _, chi2, _, error, allowed, *_ = tree.totals.tolist()
-        if not tree.behind and error <= allowed and not self._is_within(share, chi2):
-            most = share * self._share
-            left = tree.remaining(most)
-            if left <= most:
-                tree.totals[tl.T_LEAST] = max(chi2 - left, 0.0)
+        after = tree.state.item(tl.S_AFTER)
+        if not after:
+            asks = looks
+        elif after != tl.RAISED or tree.state.item(tl.S_CONTINUES):
+            asks = False
+        else:
+            _, chi2, _, error, allowed, *_ = tree.totals.tolist()
+            asks = not tree.behind and error <= allowed and not self._is_within(share, chi2)
+        if asks:
+            is_left(tree, share)
 
     def _check_determined(self) -> str:
         """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
@@ -246,8 +255,10 @@ class TreeSteps:
         result, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
         taken_back = escaped
         continues = self._graph.mark() == self._mark
-        share = _AT_END if continues else self._options.converged_share
+        share = AT_END if continues else self._options.converged_share
         goes_on = after & tl.RAISED and not bounded and not self._is_within(share, chi2)
+        opened = self._is_open and not bounded
+        goes_on |= opened
         if settle or escaped or worse or rises or goes_on or self._stalls:
             tree.exchange()
             before = self._graph.values.copy()
@@ -256,15 +267,14 @@ class TreeSteps:
             if not taken_back:
                 tree.exchange()
             result = self._batch(before, settle, continues, taken_back)
-            reasons = (settle, _ASKED), (escaped, _WITHIN), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON)
-            because = next((reason for holds, reason in reasons if holds), _STALLS)
+            because = why_batch(settle, escaped, bool(worse), bool(rises), opened, bool(goes_on))
             if result:
-                # Where the tree could not be eliminated where these steps ended it is elsewhere.
-                result.converged &= tree.totals.item(tl.T_CHI2) <= (1.0 + _AT_END) * result.chi2 + LEAST_CHI2
+                last = chi2_before - tree.totals.item(tl.T_CHI2) if continues else math.inf
+                # Where what went on with damping hardly gained the next one begins without, as one that settles does.
+                anew = result.converged or (self._damping > 0.0 and last <= _HARDLY * self._share)
+                self._damping = 0.0 if anew else result.damping
+                judge_batch(tree, result, self._options.converged_share, last)
                 tree.totals[tl.T_WHOLE], tree.state[tl.S_AFTER] = tree.totals[tl.T_CHI2], 0
-                # Of the optimum of a batch that has not converged nothing is known.
-                tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2] if result.converged else 0.0
-                self._damping = 0.0 if result.converged else result.damping
             # The tree's own step followed, and what it was before is that of the step.
             tree.totals[tl.T_BEFORE] = chi2_before
         if not math.isfinite(tree.totals[tl.T_CHI2]):
@@ -353,15 +363,16 @@ class TreeSteps:
         share = self._options.converged_share
         error += self._tree.totals.item(tl.T_EXCESS)
         converged = result.converged if result else error <= allowed and not behind
-        if not result and self._tree.raised:
-            converged &= self._is_within(share, chi2)
-        converged = converged or (not result and not self.unfinished)
+        if not result:
+            converged &= unsolved(self._tree) <= share * self._share
+            converged &= not self._tree.raised or self._is_within(share, chi2)
+            converged |= not self.unfinished
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
             "bayes-tree",
             "batch" if result else ("tree" if moved or relinearized else "extend"),
-            because or _because(relinearized, rounds, self._tree.state.item(tl.S_CHORDS)),
+            because or why_tree(relinearized, rounds, self._tree.state.item(tl.S_CHORDS)),
             result.iterations if result else rounds,
             chi2,
             max(chi2_before, 0.0),
@@ -384,17 +395,8 @@ class TreeSteps:
     def _left(self, result: Minimization | None, budget: float) -> tuple[int, float, float, float, bool]:
         """What a step with a budget has left to do, and what it took of it: the last fields of a report."""
         totals = self._tree.totals
-        model, chi2, error, least = (totals.item(k) for k in (tl.T_MODEL, tl.T_CHI2, tl.T_ERROR, tl.T_LEAST))
-        more = max(chi2 - model, 0.0) if self._tree.behind else 0.0
+        chi2, error, least = (totals.item(k) for k in (tl.T_CHI2, tl.T_ERROR, tl.T_LEAST))
         error += totals.item(tl.T_EXCESS)
-        unsolved = 0.0 if result and result.converged else min(error + more, max(chi2, 0.0) - least)
-        return self._tree.deferred, unsolved, totals.item(tl.T_WORK), budget, self.complete
-
-
-def _because(count: int, rounds: int, chords: int) -> str:
-    """Why a step did more than solve.  In several rounds one variable counts as often as it was relinearized."""
-    if not count:
-        return _CORRECTED if chords else _NOTHING_TO_RELINEARIZE
-    if rounds > 1:
-        return f"{counted(count, 'relinearization')} in {rounds} rounds"
-    return f"{counted(count, 'variable')} relinearized"
+        most = min(error + unsolved(self._tree), max(chi2, 0.0) - least)
+        left = 0.0 if result and result.converged else most
+        return self._tree.deferred, left, totals.item(tl.T_WORK), budget, self.complete
