@@ -220,14 +220,11 @@ class TreeSteps:
     def _look_again(self, looks: bool) -> None:
         """What another step would gain, where raised pivots alone stand against it; with `looks` anyhow."""
         tree, share = self._tree, self._options.converged_share
-        after = tree.state.item(tl.S_AFTER)
-        if not after:
-            asks = looks
-        elif after != tl.RAISED or tree.state.item(tl.S_CONTINUES):
-            asks = False
-        else:
+        asks, after = looks, tree.state.item(tl.S_AFTER)
+        if after:
             _, chi2, _, error, allowed, *_ = tree.totals.tolist()
-            asks = not tree.behind and error <= allowed and not self._is_within(share, chi2)
+            only_raised = after == tl.RAISED and not tree.state.item(tl.S_CONTINUES)
+            asks = only_raised and not tree.behind and error <= allowed and not self._is_within(share, chi2)
         if asks:
             is_left(tree, share)
 

@@ -77,12 +77,14 @@ def gather_separator_block(
             runs[end], runs[end + 1] = start + n, runs[3 * k + 2] + n
             end += 2
     moves = runs[3 * count : end]
+    # Too much is copied at the end of a run: the next run, row or step overwrites it.  Of rows that are copied together
+    # the last run must not reach into the next row, where vectors have two numbers.
+    together = _TOGETHER if ld - row[tl.C_SEPARATOR_SCALARS] >= RUN - 1 else 1
     for k in range(count):
-        for i in range(0, runs[3 * k + 1], _TOGETHER):
+        for i in range(0, runs[3 * k + 1], together):
             line = source + (runs[3 * k] + i) * wide
             into = target + (p + runs[3 * k + 2] + i) * ld + whole_vectors(p)
-            # Too much is copied at the end of a run: the next run or step overwrites it.
-            copy_runs(a, min(_TOGETHER, runs[3 * k + 1] - i), into, ld, line, wide, moves)
+            copy_runs(a, min(together, runs[3 * k + 1] - i), into, ld, line, wide, moves)
 
 
 @inline_kernel
