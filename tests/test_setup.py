@@ -118,7 +118,7 @@ def test_units_call_commands_that_exist_with_options_they_have(unit: str, capsys
 )
 def test_make_live_takes_any_path(told: list[str], driven: list[str]) -> None:
     ran = subprocess.run(
-        ["make", "--dry-run", "--assume-old=.venv/.ready", "live", *told],
+        ["make", "--no-print-directory", "--dry-run", "--assume-old=.venv/.ready", "live", *told],
         cwd=ROOT, env=os.environ | {"HOME": "/home/somebody"}, capture_output=True, text=True, timeout=30, check=True,
     )  # fmt: skip
     assert shlex.split(ran.stdout.splitlines()[-1])[1:] == driven
