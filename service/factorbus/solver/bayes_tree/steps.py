@@ -361,9 +361,9 @@ class TreeSteps:
         error += self._tree.totals.item(tl.T_EXCESS)
         converged = result.converged if result else error <= allowed and not behind
         if not result:
-            converged &= unsolved(self._tree) <= share * self._share
-            converged &= not self._tree.raised or self._is_within(share, chi2)
-            converged |= not self.unfinished
+            converged = converged and unsolved(self._tree) <= share * (chi2 + LEAST_CHI2)
+            converged = converged and (not self._tree.raised or self._is_within(share, chi2))
+            converged = converged or not self.unfinished
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
