@@ -1,6 +1,6 @@
 """How many examples a property is tried at: as many as its test says, or `FACTORBUS_EXAMPLES` where that is fewer.
 
-An emulated processor takes a hundred times as long for each.
+An emulated processor takes some twenty times as long for each.
 """
 
 import os

@@ -51,7 +51,7 @@ def judge_batch(tree: CliqueTree, result: Minimization, share: float, last: floa
         # The tree could not be eliminated where these steps ended, and is elsewhere.
         result.converged = False
     elif not result.converged and math.isfinite(last):
-        # Where a valley bends damped steps are short, and there are hundreds: what a whole one would gain tells whether
+        # Where a valley is curved damped steps are short and many: what a whole one would gain tells whether
         # there is anything left, and the map rests where they hardly gain.
         result.converged = not is_left(tree, SLOW * share)
     elif result.converged and chi2 < (1.0 - _ROUNDING) * result.chi2:
