@@ -22,7 +22,7 @@ def tree_of(arrays: dict[str, np.ndarray]) -> Tree:
 
 def _record_of(record: type, record_at: Any, arrays: dict[str, np.ndarray]) -> Any:
     holder: Any = type("Holder", (Arenas,), {"ARENAS": record._fields})()
-    for name, (kind, dimensions) in fields_of(record).items():
+    for name, (kind, dimensions, _columns) in fields_of(record).items():
         setattr(holder, name, arrays.get(name, np.zeros((0,) * dimensions, kind)))
     made = record_at(holder.array_table)
     made.holder = holder

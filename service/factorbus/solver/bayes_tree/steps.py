@@ -44,6 +44,7 @@ _FINISHED_LEFT = 1e-7
 # Of χ²: a step with nothing new that gains less with damping takes the wrong way.
 _HARDLY = 1e-4
 _NO_BUDGET = (0, 0.0, 0.0, 0.0, True)
+_NO_SHARES = PhaseShares(tl.PHASES, [0] * len(tl.PHASES), 0.0)
 _new = tuple.__new__
 
 
@@ -98,15 +99,18 @@ class TreeSteps:
                 tree.set_budget(math.inf)
         compiled = clock() if clock else 0.0
         self._at_linearization = False
+        if status == tl.CLEAR and not (looks or settle or self.within):
+            self._damping = 0.0
+            return self._report(started, compiled, None, because, budget if bounded else 0.0, clear=True)
         if not bounded:
             self._look_again(looks)
         escaped = self._has_escaped
         stands = not tree.state.item(tl.S_AFTER) and (bounded or not (self._is_open or self._stalls))
         if not settle and not escaped and (stands or (bounded and self._is_tolerable)):
             self._damping = 0.0
-            return self._report(started, compiled, None, because, budget if bounded else 0.0)
+            return self._report(started, compiled, None, because, budget if bounded else 0.0, clear=False)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because, escaped, bounded)
-        return self._report(started, compiled, result, because, budget if bounded else 0.0)
+        return self._report(started, compiled, result, because, budget if bounded else 0.0, clear=False)
 
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
@@ -346,30 +350,24 @@ class TreeSteps:
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
     def _report(
-        self, started: float, compiled: float, result: Minimization | None, because: str, budget: float = 0.0
+        self, started: float, compiled: float, result: Minimization | None, because: str, budget: float, clear: bool
     ) -> StepReport:
+        """clear: the step has converged, as its status says."""
         before, self._mark = self._mark, self._graph.mark()
-        now, clock = self._mark, self._options.clock
+        now, clock, tree = self._mark, self._options.clock, self._tree
         self._first_new, self._batched = before[at.VARIABLES], result is not None
-        reported = self._tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
+        reported = tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        _, chi2, _, error, allowed, chi2_before = self._tree.totals[: tl.T_BEFORE + 1].tolist()
+        _, chi2, _, error, allowed, chi2_before = tree.totals[: tl.T_BEFORE + 1].tolist()
         chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
-        behind = self._tree.behind
-        share = self._options.converged_share
-        error += self._tree.totals.item(tl.T_EXCESS)
-        converged = result.converged if result else error <= allowed and not behind
-        if not result:
-            converged = converged and unsolved(self._tree) <= share * (chi2 + LEAST_CHI2)
-            converged = converged and (not self._tree.raised or self._is_within(share, chi2))
-            converged = converged or not self.unfinished
+        converged = clear or (result.converged if result else self._has_converged(chi2, error, allowed))
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
             "bayes-tree",
             "batch" if result else ("tree" if moved or relinearized else "extend"),
-            because or why_tree(relinearized, rounds, self._tree.state.item(tl.S_CHORDS)),
+            because or why_tree(relinearized, rounds, tree.state.item(tl.S_CHORDS)),
             result.iterations if result else rounds,
             chi2,
             max(chi2_before, 0.0),
@@ -383,11 +381,22 @@ class TreeSteps:
             float(flops),
             self._damping,
             converged,
-            PhaseShares(tl.PHASES, reported[_COUNTS:], compiled_ms),
+            PhaseShares(tl.PHASES, reported[_COUNTS:], compiled_ms) if clock else _NO_SHARES,
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
-            *(self._left(result, budget) if budget else _NO_BUDGET),
-        ))  # fmt: skip
+        ) + (self._left(result, budget) if budget else _NO_BUDGET))  # fmt: skip
+
+    def _has_converged(self, chi2: float, error: float, allowed: float) -> bool:
+        """Whether the tree's own step has, by what it left."""
+        tree, share = self._tree, self._options.converged_share
+        if (
+            error + tree.totals.item(tl.T_EXCESS) <= allowed
+            and not tree.behind
+            and unsolved(tree) <= share * (chi2 + LEAST_CHI2)
+            and (not tree.raised or self._is_within(share, chi2))
+        ):
+            return True
+        return not self.unfinished
 
     def _left(self, result: Minimization | None, budget: float) -> tuple[int, float, float, float, bool]:
         """What a step with a budget has left to do, and what it took of it: the last fields of a report."""

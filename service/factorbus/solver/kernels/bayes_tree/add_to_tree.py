@@ -84,7 +84,7 @@ def add_factors(graph: Graph, tree: Tree, f1: int) -> bool:
             totals[tl.T_LARGEST_DIAGONAL] = max(totals[tl.T_LARGEST_DIAGONAL], largest_diagonal_of(j, var, scalars))
         factor_errors[f, tl.E_CHI2] = 0.0
         if not is_member(f, fac):
-            factor_errors[f, tl.E_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
+            factor_errors[f, tl.E_CHI2] = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
         factor_errors[f, tl.E_ERROR] = factor_errors[f, tl.E_LEAVES] = factor_errors[f, tl.E_COUNTED] = 0.0
         totals[tl.T_ADDED] += factor_errors[f, tl.E_CHI2]
         finite &= math.isfinite(hessian[last_of_hessian(f, var, fac, link)])

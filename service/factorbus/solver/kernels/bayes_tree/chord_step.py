@@ -23,15 +23,11 @@ from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.back_substitute import QUIET, substitute
 from factorbus.solver.kernels.bayes_tree.eliminate_again import lap
 from factorbus.solver.kernels.bayes_tree.linearization_error import measure
-from factorbus.solver.kernels.bayes_tree.missed_residual import (
-    error_quaternion,
-    missed_se2,
-    missed_se3,
-    turn_since_linearized,
-)
+from factorbus.solver.kernels.bayes_tree.missed_residual import missed_se2, missed_se3, turn_since_linearized
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
+from factorbus.solver.kernels.bayes_tree.seen_in_space import seen_se3
 from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work, work_of_solving_all
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
@@ -147,15 +143,13 @@ def correct_se3(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     var, fac, p, lin = graph.var, graph.fac, graph.payload, tree.lin[0]
     row, hessian, r, W = tree.factor_errors[f], tree.hessian, scratch.r, scratch.W
     i, j, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
-    m0, m1, m2, m3, m4, m5, _, _ = missed_se3(graph, tree, f)
+    m0, m1, m2, m3, m4, m5, _, _ = missed_se3(graph, tree, f, seen_se3(i, j, k, p, graph.values))
     row[tl.E_MISSED], row[tl.E_MISSED + 1], row[tl.E_MISSED + 2] = m0, m1, m2
     row[tl.E_MISSED + 3], row[tl.E_MISSED + 4], row[tl.E_MISSED + 5] = m3, m4, m5
     a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, i + 3)
     z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation_matrix(p, k + 3)
-    tx, ty, tz = lin[j] - lin[i], lin[j + 1] - lin[i + 1], lin[j + 2] - lin[i + 2]
-    dx, dy, dz = a0 * tx + a3 * ty + a6 * tz, a1 * tx + a4 * ty + a7 * tz, a2 * tx + a5 * ty + a8 * tz
+    dx, dy, dz, v0, v1, v2, w = seen_se3(i, j, k, p, lin)
     tx, ty, tz = dx - p[k], dy - p[k + 1], dz - p[k + 2]
-    v0, v1, v2, w = error_quaternion(i, j, k, p, lin)
     r[0], r[1] = z0 * tx + z3 * ty + z6 * tz + m0, z1 * tx + z4 * ty + z7 * tz + m1
     r[2], r[3], r[4], r[5] = z2 * tx + z5 * ty + z8 * tz + m2, v0 + m3, v1 + m4, v2 + m5
     q, chi2, e = k + 7, 0.0, W[0]

@@ -126,6 +126,19 @@ def converged_error(settings: F64, state: I64, totals: F64) -> float:
 
 
 @inline_kernel
+def is_clear(state: I64, totals: F64) -> bool:
+    """Whether a step that had something new has converged, and nothing speaks against it or is left behind."""
+    return (
+        state[tl.S_AFTER] == 0
+        and state[tl.S_CONTINUES] == 0
+        and state[tl.S_BEHIND] == 0
+        and totals[tl.T_EXCESS] == 0.0
+        and totals[tl.T_LEFT] < math.inf
+        and totals[tl.T_ERROR] <= totals[tl.T_ALLOWED]
+    )
+
+
+@inline_kernel
 def note_after(settings: F64, state: I64, totals: F64) -> None:
     """What is to be done after the step, and what the optimum is at least."""
     chi2 = totals[tl.T_CHI2]

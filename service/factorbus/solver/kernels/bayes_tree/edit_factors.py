@@ -181,7 +181,7 @@ def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
         for row in range(f, f + rows_of(f, fac)):
             weigh_factor(graph, tree, row, scratch)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
-        factor_errors[f, tl.E_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
+        factor_errors[f, tl.E_CHI2] = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
         totals[tl.T_CHI2] += factor_errors[f, tl.E_CHI2] - was
         totals[tl.T_ADDED_UP] += factor_errors[f, tl.E_CHI2] + was
         if not has_free(f, var, fac) and not is_one_of_many(f, fac):

@@ -1,7 +1,8 @@
 """χ² of one factor at the estimate of the tree, without its Jacobians.  MATH (4.1), §3.2
 
 What a step moves, it measures: so this is called more often than all else that evaluates a factor, and the common kinds
-have code of their own.  They are the residuals of `se2` and `se3`, to rounding; every other kind is evaluated there.
+have code of their own.  They are the residuals of `se2`, to rounding; every other kind but poses in space
+(`seen_in_space`) is evaluated as when it is linearized.
 """
 
 import math
@@ -12,6 +13,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.hessian_room import kept_samples
 from factorbus.solver.kernels.bayes_tree.imu_error import chi2_of_imu, is_plain_imu
 from factorbus.solver.kernels.bayes_tree.records import Tree
+from factorbus.solver.kernels.bayes_tree.seen_in_space import between_se3_chi2, is_isotropic_in_space
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
@@ -20,33 +22,35 @@ from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.many import chi2_of_many
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
 SMALL_ANGLE = 0.1  # radians: below it the series of sine and cosine are exact to rounding
 
 
 @inline_kernel
-def chi2_of_factor(graph: Graph, tree: Tree, f: int, kind: int, c: float, s: float) -> tuple[float, float, float]:
-    """rᵀΩr, or ρ of it, of factor f at `values`; between poses the square of the translation in r; and between those in
-    space the rotation's share of χ².  kind: its `L_KIND`; c, s: cosine and sine of its first, plane pose.
+def chi2_of_factor(graph: Graph, tree: Tree, f: int, kind: int, c: float, s: float) -> float:
+    """rᵀΩr, or ρ of it, of factor f at `values`.
+
+    kind: its `L_KIND`; c, s: cosine and sine of its first, plane pose
     """
     var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
-    factor_errors = tree.factor_errors
     if kind == at.BETWEEN_SE2:
-        return between_se2_chi2(f, c, s, var, fac, values, payload, factor_errors)
+        return between_se2_chi2(f, c, s, var, fac, values, payload, tree.factor_errors)[0]
     if kind == at.LANDMARK_SE2:
-        return landmark_se2_chi2(f, c, s, var, fac, values, payload), 0.0, 0.0
+        return landmark_se2_chi2(f, c, s, var, fac, values, payload)
     if kind == at.BETWEEN_SE3:
-        return between_se3_chi2(f, var, fac, values, payload)
-    return any_chi2(f, graph, tree), 0.0, 0.0
+        return between_se3_chi2(f, graph, tree)[0]
+    return any_chi2(f, graph, tree)
 
 
 @inline_kernel
 def between_se2_chi2(
     f: int, c: float, s: float, var: I64, fac: I64, values: F64, payload: F64, factor_errors: F64
-) -> tuple[float, float, float]:
-    """(3.2).  Where Ω is that of a disc and of an angle apart, the frame of the measurement does not matter."""
+) -> tuple[float, float]:
+    """(3.2), and the square of the translation in r.
+
+    Where Ω is the same for a translation in all directions the frame of the measurement does not matter.
+    """
     x, y, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
     tx, ty = load(values, y) - load(values, x), load(values, y + 1) - load(values, x + 1)
     ex, ey = c * tx + s * ty - load(payload, k), c * ty - s * tx - load(payload, k + 1)
@@ -54,12 +58,12 @@ def between_se2_chi2(
     gap = ex * ex + ey * ey
     form = factor_errors[f, tl.E_FORM]
     if form == tl.ISOTROPIC or form == tl.ISOTROPIC + tl.CORRECTED:
-        return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, gap, 0.0
+        return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, gap
     cz, sz = math.cos(load(payload, k + 2)), math.sin(load(payload, k + 2))
     rx, ry = cz * ex + sz * ey, cz * ey - sz * ex
     cross = load(payload, k + 4) * rx * ry + (load(payload, k + 5) * rx + load(payload, k + 7) * ry) * turn
     square = load(payload, k + 3) * rx * rx + load(payload, k + 6) * ry * ry + load(payload, k + 8) * turn * turn
-    return square + 2.0 * cross, gap, 0.0
+    return square + 2.0 * cross, gap
 
 
 @inline_kernel
@@ -69,31 +73,6 @@ def landmark_se2_chi2(f: int, c: float, s: float, var: I64, fac: I64, values: F6
     tx, ty = load(values, y) - load(values, x), load(values, y + 1) - load(values, x + 1)
     ex, ey = c * tx + s * ty - load(payload, k), c * ty - s * tx - load(payload, k + 1)
     return load(payload, k + 2) * ex * ex + 2.0 * load(payload, k + 3) * ex * ey + load(payload, k + 4) * ey * ey
-
-
-@part
-def between_se3_chi2(f: int, var: I64, fac: I64, x: F64, p: F64) -> tuple[float, float, float]:
-    """(3.6)"""
-    i, j, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
-    z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation_matrix(p, k + 3)
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
-    tx, ty, tz = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
-    ex = a0 * tx + a3 * ty + a6 * tz - p[k]
-    ey = a1 * tx + a4 * ty + a7 * tz - p[k + 1]
-    ez = a2 * tx + a5 * ty + a8 * tz - p[k + 2]
-    r0, r1, r2 = z0 * ex + z3 * ey + z6 * ez, z1 * ex + z4 * ey + z7 * ez, z2 * ex + z5 * ey + z8 * ez
-    qx, qy, qz, qw = quat_product(-x[i + 3], -x[i + 4], -x[i + 5], x[i + 6], x[j + 3], x[j + 4], x[j + 5], x[j + 6])
-    r3, r4, r5, w = quat_product(-p[k + 3], -p[k + 4], -p[k + 5], p[k + 6], qx, qy, qz, qw)
-    if w < 0.0:
-        r3, r4, r5 = -r3, -r4, -r5
-    k += 7
-    gap = r0 * r0 + r1 * r1 + r2 * r2
-    total = r0 * (p[k] * r0 + 2.0 * (p[k + 1] * r1 + p[k + 2] * r2 + p[k + 3] * r3 + p[k + 4] * r4 + p[k + 5] * r5))
-    total += r1 * (p[k + 6] * r1 + 2.0 * (p[k + 7] * r2 + p[k + 8] * r3 + p[k + 9] * r4 + p[k + 10] * r5))
-    total += r2 * (p[k + 11] * r2 + 2.0 * (p[k + 12] * r3 + p[k + 13] * r4 + p[k + 14] * r5))
-    turned = r3 * (p[k + 15] * r3 + 2.0 * (p[k + 16] * r4 + p[k + 17] * r5))
-    turned += r4 * (p[k + 18] * r4 + 2.0 * p[k + 19] * r5) + r5 * p[k + 20] * r5
-    return total + turned, gap, turned
 
 
 @part
@@ -135,5 +114,9 @@ def heading_of(v: int, planar: bool, var: I64, delta: F64, values: F64, turns: F
 
 @inline_kernel
 def is_isotropic(kind: int, k: int, p: F64) -> bool:
-    """Whether the information of a relative plane pose, behind its measurement at k, is that of a disc and an angle."""
-    return kind == at.BETWEEN_SE2 and p[k + 3] == p[k + 6] and p[k + 4] == 0.0 and p[k + 5] == 0.0 and p[k + 7] == 0.0
+    """Whether the information of a relative pose, behind its measurement at k, is the same for a translation in all
+    directions and has nothing to do with the rotation.
+    """
+    if kind == at.BETWEEN_SE2:
+        return p[k + 3] == p[k + 6] and p[k + 4] == 0.0 and p[k + 5] == 0.0 and p[k + 7] == 0.0
+    return kind == at.BETWEEN_SE3 and is_isotropic_in_space(k, p)

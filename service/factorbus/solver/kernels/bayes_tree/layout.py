@@ -156,8 +156,8 @@ S_FREE = 64  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
-# What a step comes to.
-DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
+# What a step comes to.  CLEAR: it is done, has converged, and nothing has to be looked at again.
+DONE, NO_ROOM, FAILED, UNSURE, INFINITE, CLEAR = 0, 1, 2, 3, 4, 5
 
 # In S_RAISED.
 RAISED_PIVOT, DAMPED = 1, 2

@@ -10,33 +10,16 @@ import math
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
-from factorbus.solver.kernels.bayes_tree.error_terms import (
-    LINKS,
-    SEEN,
-    add_observation,
-    lever_error_of,
-    shift_between,
-    turn_error,
-    turn_of,
-)
-from factorbus.solver.kernels.bayes_tree.exact_error import exact_error
-from factorbus.solver.kernels.bayes_tree.factor_chi2 import any_chi2, chi2_of_factor, heading_of
-from factorbus.solver.kernels.bayes_tree.missed_residual import missed_error_se2, missed_error_se3
+from factorbus.solver.kernels.bayes_tree.error_terms import lever_error_of, shift_between, turn_of
+from factorbus.solver.kernels.bayes_tree.evaluate_factor import evaluate_factor
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import heading_of
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, STAYED
+from factorbus.solver.kernels.bayes_tree.pending import mark_ends_pending
 from factorbus.solver.kernels.bayes_tree.records import Tree
-from factorbus.solver.kernels.bayes_tree.relinearize import WAITS
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.sorting import put_in_order
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.factor_rows import (
-    count_ends,
-    end_of,
-    head_of,
-    is_member,
-    is_one_of_many,
-    loss_code,
-)
-from factorbus.solver.kernels.model.kinds import is_bounded
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, head_of, is_member, is_one_of_many
 from factorbus.solver.kernels.model.records import Graph
 
 LEAST_REQUIRED_SHARE = 0.02
@@ -45,8 +28,6 @@ MUCH = 8  # where more than one variable in this number has moved, all factors a
 # The running sums are computed anew once the magnitudes added to them exceed this multiple of χ².
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
-ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
-MOST_ERROR = 1e100  # of a factor: its square is still a number
 
 
 @part
@@ -168,126 +149,6 @@ def first_moved_row(f: int, u: int, fac: I64, node: I64) -> int:
     return -1
 
 
-@inline_kernel
-def evaluate_factor(
-    graph: Graph, tree: Tree, f: int, v: int, c: float, s: float, how: int, threshold: float
-) -> tuple[float, float, float, float, float]:
-    """χ² of factor f, whose first variable is v, and its linearization error, where more of it than its place moved.
-
-    Gives the error; by what χ² is more than before; the sum of both, and of error² now and before; by what error² in
-    full and as it counts is more.
-    """
-    var, fac = graph.var, graph.fac
-    node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
-    error, full, leaves = 0.0, 0.0, 0.0
-    kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
-    if not is_bounded(kind) or kind == at.PRIOR_SE3 or loss_code(f, fac) != at.NO_LOSS:
-        if how < MODEL:
-            chi2 = any_chi2(f, graph, tree)
-        else:
-            error, force, chi2 = exact_error(f, graph, tree)
-            error = min(error, MOST_ERROR)
-            full = min(error + force, MOST_ERROR)
-            leaves = full = ROBUST * full if loss_code(f, fac) != at.NO_LOSS else full
-            if error > threshold:
-                mark_ends_pending(f, fac, var, node, pending, state)
-    else:
-        chi2, gap, _ = chi2_of_factor(graph, tree, f, kind, c, s)
-        if second >= 0 and how == MODEL:
-            error, full, leaves = error_of(graph, tree, f, v, threshold, gap, chi2)
-    was = factor_errors[f, tl.E_CHI2]
-    factor_errors[f, tl.E_CHI2] = chi2
-    if how < MODEL:
-        return error, chi2 - was, chi2 + was, 0.0, 0.0
-    full, counted = full * full, error * error if error > threshold else 0.0
-    full_before, counted_before = factor_errors[f, tl.E_ERROR], factor_errors[f, tl.E_COUNTED]
-    factor_errors[f, tl.E_ERROR], factor_errors[f, tl.E_COUNTED] = full, counted
-    factor_errors[f, tl.E_LEAVES] = leaves * leaves
-    size = chi2 + was + full + full_before
-    return error, chi2 - was, size, full - full_before, counted - counted_before
-
-
-@inline_kernel
-def error_of(
-    graph: Graph, tree: Tree, f: int, v: int, threshold: float, gap: float, chi2: float
-) -> tuple[float, float, float]:
-    """How far factor f, whose first variable is v, is from its linear model: as it counts, in full, and what of that a
-    chord step leaves.  Between poses v waits where (9.4) is more than `relinearize_threshold`, else where the error is.
-
-    Between poses in space (9.4) and (9.26) stand for (9.33) and (9.34) where they are below that threshold.
-    """
-    var, kind, second = graph.var, graph.fac[f, at.F_KIND], graph.fac[f, at.F_J]
-    free = var[v, at.V_COLUMN] >= 0
-    if kind == at.BETWEEN_SE2:
-        error, full, leaves, marks, both = error_between_se2(graph, tree, f, threshold, gap, chi2)
-    elif kind == at.BETWEEN_SE3:
-        error, full, leaves, marks, both = error_between_se3(graph, tree, f, threshold, gap, chi2)
-    else:
-        d, root, moved = lever_and_shift(graph, tree, f, v)
-        phi = turn_of(var[v, at.V_KIND], tree.scalars[0], var[v, at.V_SCALAR]) if free else 0.0
-        lever_error, shift_error = add_observation(
-            kind, lever_error_of(root, d, phi, moved), root, d, moved, tree.factor_errors[f, tl.E_SHIFT]
-        )
-        full = error = leaves = min(SEEN * (lever_error + shift_error), MOST_ERROR)
-        both, marks = kind == at.BEARING_RANGE_SE2 or shift_error > lever_error, error > threshold
-    if marks:
-        if free:
-            mark_pending(v, tree.node, tree.pending, tree.state)
-        if (both or not free) and var[second, at.V_COLUMN] >= 0:
-            mark_pending(second, tree.node, tree.pending, tree.state)
-    return error, full, leaves
-
-
-@inline_kernel
-def lever_and_shift(graph: Graph, tree: Tree, f: int, v: int) -> tuple[float, float, float]:
-    """d and √ω of factor f, whose first variable is v, and |sⱼ − sᵢ|."""
-    var, row, planar = graph.var, tree.factor_errors[f], graph.var[v, at.V_KIND] == at.SE2
-    x, y = var[v, at.V_AT], var[graph.fac[f, at.F_J], at.V_AT]
-    return row[tl.E_LEVER], row[tl.E_ROOT], shift_between(planar, x, y, graph.values, tree.lin[0])
-
-
-@inline_kernel
-def error_between_se2(
-    graph: Graph, tree: Tree, f: int, threshold: float, gap: float, chi2: float
-) -> tuple[float, float, float, bool, bool]:
-    """Of a factor between plane poses what `error_of` gives, whether a pose waits, and whether both do.
-
-    Most factors are far below the threshold, for which squares do: (a + b + c)² ≤ 3 (a² + b² + c²).
-    """
-    row = tree.factor_errors[f]
-    missed, moved, shift, phi, psi = missed_error_se2(graph, tree, f)
-    d, root, weight, phi = row[tl.E_LEVER], row[tl.E_ROOT], row[tl.E_SHIFT], abs(phi)
-    seen, lever = weight * math.sqrt(gap * shift), root * 0.5 * d * phi * phi
-    turned, linked = root * root * phi * phi * moved, LINKS * LINKS * weight * weight * gap * moved
-    marks = both = False
-    if 3.0 * (lever * lever + turned + linked) > threshold * threshold:
-        lever, link = lever + math.sqrt(turned), math.sqrt(linked)
-        marks, both = lever + link > threshold, link > lever
-    leaves = min(seen + psi * math.sqrt(chi2), MOST_ERROR)
-    return min(missed + LINKS * seen, MOST_ERROR), min(missed + leaves, MOST_ERROR), leaves, marks, both
-
-
-@inline_kernel
-def error_between_se3(
-    graph: Graph, tree: Tree, f: int, threshold: float, gap: float, chi2: float
-) -> tuple[float, float, float, bool, bool]:
-    """The same of a factor between poses in space."""
-    var, row, delta = graph.var, tree.factor_errors[f], tree.scalars[0]
-    v, second = graph.fac[f, at.F_I], graph.fac[f, at.F_J]
-    d, root, moved = lever_and_shift(graph, tree, f, v)
-    phi = turn_of(at.SE3, delta, var[v, at.V_SCALAR]) if var[v, at.V_COLUMN] >= 0 else 0.0
-    turn = phi + (turn_of(at.SE3, delta, var[second, at.V_SCALAR]) if var[second, at.V_COLUMN] >= 0 else 0.0)
-    lever_error, shift_error = lever_error_of(root, d, phi, moved), row[tl.E_SHIFT] * math.sqrt(gap)
-    link = LINKS * shift_error * moved
-    marks, both = lever_error + link > threshold, link > lever_error
-    missed, shift, psi = lever_error + turn_error(phi, turn, row[tl.E_TURN]), moved, turn
-    if marks or missed > threshold or row[tl.E_FORM] >= tl.CORRECTED:
-        missed, shift, psi = missed_error_se3(graph, tree, f)
-    leaves = min(shift_error * shift + psi * math.sqrt(chi2), MOST_ERROR)
-    error = min(missed + LINKS * shift_error * shift, MOST_ERROR)
-    return error, min(missed + leaves, MOST_ERROR), leaves, marks, both
-
-
 @part
 def mark_large_errors(least: float, graph: Graph, tree: Tree) -> None:
     """The variables of all factors whose error² in full is more than `least` wait."""
@@ -312,24 +173,6 @@ def moves_far(f: int, least: float, graph: Graph, tree: Tree) -> bool:
     gap = math.sqrt(max(row[tl.E_CHI2], 0.0)) / root if root > 0.0 else 0.0
     error = lever_error_of(root, row[tl.E_LEVER], phi, shift) + row[tl.E_SHIFT] * gap * shift
     return error * error > least
-
-
-@inline_kernel
-def mark_ends_pending(f: int, fac: I64, var: I64, node: I64, pending: I64, state: I64) -> None:
-    """The variables of factor f that are free are to be relinearized."""
-    for n in range(count_ends(f, fac)):
-        v = end_of(f, n, fac)
-        if var[v, at.V_COLUMN] >= 0:
-            mark_pending(v, node, pending, state)
-
-
-@inline_kernel
-def mark_pending(v: int, node: I64, pending: I64, state: I64) -> None:
-    """Variable v is to be relinearized."""
-    if node[v, tl.N_FLAGS] == 0:
-        node[v, tl.N_FLAGS] = WAITS
-        pending[state[tl.S_PENDING]] = v
-        state[tl.S_PENDING] += 1
 
 
 @inline_kernel

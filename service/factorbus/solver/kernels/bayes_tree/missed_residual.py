@@ -15,6 +15,7 @@ import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
+from factorbus.solver.kernels.bayes_tree.seen_in_space import error_quaternion
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
@@ -61,12 +62,13 @@ def missed_se2(x: int, y: int, phi: float, values: F64, lin: F64) -> tuple[float
 
 
 @part
-def missed_error_se3(graph: Graph, tree: Tree, f: int) -> tuple[float, float, float]:
+def missed_error_se3(graph: Graph, tree: Tree, f: int, seen: tuple) -> tuple[float, float, float]:
     """√(bᵀ Ω b) of factor f between poses in space, b being (9.33) and (9.34) less what a chord step has corrected its
     model by; by how much the second pose has shifted and turned as seen from the first, since both were linearized.
+    seen: `seen_se3` of it at the estimate
     """
     p, k, row = graph.payload, graph.fac[f, at.F_AT] + 7, tree.factor_errors[f]
-    b0, b1, b2, b3, b4, b5, shift, psi = missed_se3(graph, tree, f)
+    b0, b1, b2, b3, b4, b5, shift, psi = missed_se3(graph, tree, f, seen)
     if row[tl.E_FORM] >= tl.CORRECTED:
         b0, b1, b2 = b0 - row[tl.E_MISSED], b1 - row[tl.E_MISSED + 1], b2 - row[tl.E_MISSED + 2]
         b3, b4, b5 = b3 - row[tl.E_MISSED + 3], b4 - row[tl.E_MISSED + 4], b5 - row[tl.E_MISSED + 5]
@@ -89,7 +91,9 @@ def versed_and_late(phi: float) -> tuple[float, float]:
 
 
 @part
-def missed_se3(graph: Graph, tree: Tree, f: int) -> tuple[float, float, float, float, float, float, float, float]:
+def missed_se3(
+    graph: Graph, tree: Tree, f: int, seen: tuple
+) -> tuple[float, float, float, float, float, float, float, float]:
     """R_zᵀ times (9.33), and (9.34), of factor f between poses in space, so in the frame of its residual.  And by how
     much the second pose has shifted and turned as seen from the first.
     """
@@ -102,8 +106,7 @@ def missed_se3(graph: Graph, tree: Tree, f: int) -> tuple[float, float, float, f
     if second >= 0:
         bx, by, bz = delta[second + 3], delta[second + 4], delta[second + 5]
     tx, ty, tz = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
-    sx, sy, sz = a0 * tx + a3 * ty + a6 * tz, a1 * tx + a4 * ty + a7 * tz, a2 * tx + a5 * ty + a8 * tz
+    sx, sy, sz, vx, vy, vz, vw = seen
     a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, i + 3)
     ux = sx - (a0 * tx + a3 * ty + a6 * tz)
     uy = sy - (a1 * tx + a4 * ty + a7 * tz)
@@ -115,7 +118,6 @@ def missed_se3(graph: Graph, tree: Tree, f: int) -> tuple[float, float, float, f
     ux, uy, uz = ux + py * dz - pz * dy, uy + pz * dx - px * dz, uz + px * dy - py * dx
     z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation_matrix(p, k + 3)
     ax, ay, az = z0 * px + z3 * py + z6 * pz, z1 * px + z4 * py + z7 * pz, z2 * px + z5 * py + z8 * pz
-    vx, vy, vz, vw = error_quaternion(i, j, k, p, x)
     v0, v1, v2, w = error_quaternion(i, j, k, p, lin)
     rx, ry, rz, _ = quat_product(-v0, -v1, -v2, w, vx, vy, vz, vw)
     w = turn_slope(w)
@@ -130,13 +132,3 @@ def missed_se3(graph: Graph, tree: Tree, f: int) -> tuple[float, float, float, f
         shift,
         2.0 * math.sqrt(rx * rx + ry * ry + rz * rz),
     )
-
-
-@inline_kernel
-def error_quaternion(i: int, j: int, k: int, p: F64, x: F64) -> tuple:
-    """q_z⁻¹ ⊗ qᵢ⁻¹ ⊗ qⱼ with w ≥ 0, x y z w."""
-    qx, qy, qz, qw = quat_product(-x[i + 3], -x[i + 4], -x[i + 5], x[i + 6], x[j + 3], x[j + 4], x[j + 5], x[j + 6])
-    vx, vy, vz, w = quat_product(-p[k + 3], -p[k + 4], -p[k + 5], p[k + 6], qx, qy, qz, qw)
-    if w < 0.0:
-        return -vx, -vy, -vz, -w
-    return vx, vy, vz, w

@@ -1,9 +1,10 @@
 """The tree of cliques and a step of it as kernels see them: arrays by name."""
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
+from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.jit.compile import I64
-from factorbus.solver.kernels.jit.records import FloatRows, Floats, IntRows, Ints, opener
+from factorbus.solver.kernels.jit.records import Columns, FloatRows, Floats, IntRows, Ints, opener
 
 
 class Tree(NamedTuple):
@@ -36,16 +37,16 @@ class Tree(NamedTuple):
     """
 
     settings: Floats
-    node: IntRows
-    link: IntRows
-    clique: IntRows
+    node: Annotated[IntRows, Columns(tl.N_WIDTH)]
+    link: Annotated[IntRows, Columns(tl.L_WIDTH)]
+    clique: Annotated[IntRows, Columns(tl.C_WIDTH)]
     lists: Ints
     numbers: Floats
     hessian: Floats
     lin: FloatRows
     scalars: FloatRows
-    factor_errors: FloatRows
-    turns: FloatRows
+    factor_errors: Annotated[FloatRows, Columns(tl.E_WIDTH)]
+    turns: Annotated[FloatRows, Columns(tl.U_WIDTH)]
     pending: Ints
     changed: Ints
     moved: Ints

@@ -27,6 +27,7 @@ from factorbus.solver.kernels.bayes_tree.chord_step import TOO_MUCH, chord_step
 from factorbus.solver.kernels.bayes_tree.convergence import (
     check_decrement,
     goes_on,
+    is_clear,
     least_error,
     mark_unconverged,
     may_keep_factor,
@@ -58,7 +59,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     """Take in what is new in the graph, and solve.  graph_table, tree_table: of their arrays (`records`); queue: for
     worker threads (`task_queue`); worker: NOBODY, or this is a worker thread (`run_tasks`).
 
-    Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
+    Gives DONE, or CLEAR; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
     or FAILED: the pivot of S_FAILED was not positive; or INFINITE: the χ² of a new factor is beyond numbers.  After
     the last two the tree is as it was before the step.
@@ -148,7 +149,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     if put_off and state[tl.S_CONTINUES] == 0 and is_in_vain(scaled, state, totals):
         state[tl.S_TRY_AT] = state[tl.S_STEP] + RETRY
     note_after(settings, state, totals)
-    return tl.DONE
+    return tl.CLEAR if is_clear(state, totals) else tl.DONE
 
 
 @inline_kernel

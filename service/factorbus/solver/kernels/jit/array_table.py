@@ -54,16 +54,19 @@ else:
 
         return types.int64(array), emit
 
-    def array_entry(context: Any, builder: Any, made: Any, words: Any, entry: Any) -> Any:
+    def array_entry(context: Any, builder: Any, made: Any, words: Any, entry: Any, columns: int = 0) -> Any:
         """The array of type `made` at this entry of the table that begins at the pointer `words`.
 
         A table does not change while a kernel runs, so the compiler may look an array up once for a whole loop.
+        columns: of a row, where they are always as many, so that an offset is a shift; 0: the table says.
         """
         first, row = builder.mul(entry, ir.IntType(64)(WIDTH)), []
         for k in range(1 + made.ndim):
             word = builder.load(builder.gep(words, [builder.add(first, ir.IntType(64)(k))]))
             word.set_metadata("invariant.load", builder.module.add_metadata([]))
             row.append(word)
+        if columns > 0:
+            row[2] = ir.IntType(64)(columns)
         return make_array(context, builder, made, row[0], row[1:])
 
     def _compiled(kind: Any, dimensions: int) -> Any:

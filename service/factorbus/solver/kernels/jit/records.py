@@ -6,6 +6,7 @@ that makes one of a table of addresses (`array_table`), whose rows are in the or
     class Lists(NamedTuple):
         starts: Ints
         values: FloatRows
+        places: Annotated[IntRows, Columns(4)]
 
     lists_at = opener(Lists)
 
@@ -19,7 +20,7 @@ name is used.  So a table must stay as it is while a kernel runs.
 """
 
 from collections.abc import Callable
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -35,9 +36,27 @@ FloatRows = Annotated[F64, (np.float64, 2)]
 Record = TypeVar("Record", bound=tuple[Any, ...])
 
 
-def fields_of(record: type) -> dict[str, Any]:
-    """The names of a record in the order of its table, each with what the array holds and its dimensions."""
-    return {name: hint.__metadata__[0] for name, hint in get_type_hints(record, include_extras=True).items()}
+class Columns(NamedTuple):
+    """How many columns an array of rows always has: kernels then compute with the number instead of reading it."""
+
+    count: int
+
+
+class Field(NamedTuple):
+    """What an array of a record holds, its dimensions, and how many columns it always has; 0: that varies."""
+
+    kind: type
+    dimensions: int
+    columns: int
+
+
+def fields_of(record: type) -> dict[str, Field]:
+    """The fields of a record by name, in the order of its table."""
+    fields = {}
+    for name, hint in get_type_hints(record, include_extras=True).items():
+        (kind, dimensions), *columns = hint.__metadata__
+        fields[name] = Field(kind, dimensions, columns[0].count if columns else 0)
+    return fields
 
 
 def opener(record: type[Record]) -> Callable[[I64], Record]:
@@ -51,7 +70,7 @@ _open: Any
 
 def _open_in_python(record: type) -> Any:
     """What makes records of tables in Python; tests call parts of kernels with them."""
-    kinds = tuple(fields_of(record).values())
+    kinds = [(field.kind, field.dimensions) for field in fields_of(record).values()]
     with_table: Any = type(record.__name__, (record,), {})
 
     def record_at(table: I64) -> Any:
@@ -85,8 +104,8 @@ else:
 
         def __init__(self, record: type) -> None:
             self.entries = {
-                name: (k, types.Array(_ENTRIES[kind], dimensions, "C"))
-                for k, (name, (kind, dimensions)) in enumerate(fields_of(record).items())
+                name: (k, types.Array(_ENTRIES[field.kind], field.dimensions, "C"), field.columns)
+                for k, (name, field) in enumerate(fields_of(record).items())
             }
             super().__init__(name=f"{record.__module__}.{record.__qualname__}")
 
@@ -107,8 +126,8 @@ else:
 
     @extending.lower_getattr_generic(RecordType)
     def _look_up(context: Any, builder: Any, typ: Any, table: Any, attr: str) -> Any:
-        entry, made = typ.entries[attr]
-        return array_entry(context, builder, made, table, ir.IntType(64)(entry))
+        entry, made, columns = typ.entries[attr]
+        return array_entry(context, builder, made, table, ir.IntType(64)(entry), columns)
 
     @intrinsic
     def _table(_typing: Any, record: Any) -> Any:

@@ -1,8 +1,9 @@
 """The factor graph as kernels see it: its arrays by name."""
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from factorbus.solver.kernels.jit.records import Floats, IntRows, Ints, opener
+from factorbus.solver.kernels.jit.records import Columns, Floats, IntRows, Ints, opener
+from factorbus.solver.kernels.model import layout as at
 
 
 class Graph(NamedTuple):
@@ -20,8 +21,8 @@ class Graph(NamedTuple):
     stamps   (n,)   int64    the variables' time stamps, which the solver carries and never looks into; NO_STAMP: none
     """
 
-    var: IntRows
-    fac: IntRows
+    var: Annotated[IntRows, Columns(at.V_WIDTH)]
+    fac: Annotated[IntRows, Columns(at.F_WIDTH)]
     values: Floats
     payload: Floats
     counts: Ints
