@@ -13,6 +13,7 @@ from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels.bayes_tree.missed_residual import missed_error_se2, missed_error_se3, missed_se3
 from factorbus.solver.kernels.bayes_tree.records import tree_at
+from factorbus.solver.kernels.bayes_tree.seen_in_space import between_se3_chi2
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.records import graph_at
@@ -49,8 +50,9 @@ def test_what_is_missed_is_the_residual_less_the_model(world: str, turn: float) 
         p = int(graph.fac[f, at.F_AT] + information_at(kind))
         weight = full(graph.payload[p : p + dim * (dim + 1) // 2])
         if kind == at.BETWEEN_SE3:
-            np.testing.assert_allclose(missed_se3(graph_arrays, tree_arrays, f)[:6], b, rtol=1e-7, atol=1e-12)
-            told, shift, psi = missed_error_se3(graph_arrays, tree_arrays, f)
+            _, _, seen = between_se3_chi2(f, graph_arrays, tree_arrays)
+            np.testing.assert_allclose(missed_se3(graph_arrays, tree_arrays, f, seen)[:6], b, rtol=1e-7, atol=1e-12)
+            told, shift, psi = missed_error_se3(graph_arrays, tree_arrays, f, seen)
         else:
             b[2] = (b[2] + np.pi) % (2 * np.pi) - np.pi
             weight = np.diag([max(weight[0, 0], weight[1, 1])] * 2 + [0.0])

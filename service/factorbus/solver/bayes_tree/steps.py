@@ -14,6 +14,7 @@ from factorbus.solver import errors
 from factorbus.solver.bayes_tree.left_to_gain import AT_END, is_left, judge_batch, unsolved
 from factorbus.solver.bayes_tree.reasons import why_batch, why_tree
 from factorbus.solver.bayes_tree.tree import CliqueTree
+from factorbus.solver.bayes_tree.undetermined import check_determined
 from factorbus.solver.graph.escaped import find_beyond
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
@@ -31,9 +32,7 @@ from factorbus.solver.optimize.system import System
 from factorbus.solver.option_ranges import MOST_BUDGET
 from factorbus.solver.options import Options
 from factorbus.solver.report import PhaseShares, StepReport, Stopwatch
-from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
 from factorbus.solver.sparse.elimination import Elimination
-from factorbus.wording import counted
 
 _START: Mark = (0,) * at.COUNTS
 _ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
@@ -85,7 +84,7 @@ class TreeSteps:
         try:
             status = tree.step()
             if status == tl.UNSURE:
-                because = self._check_determined()
+                because = check_determined(self._graph, self._mark, lambda: self._system(self._apart()))
                 status = tree.step(sure=True)
             if status == tl.FAILED:
                 raise self._system(self._apart()).underconstrained(tree.failed)
@@ -231,23 +230,6 @@ class TreeSteps:
             asks = only_raised and not tree.behind and error <= allowed and not self._is_within(share, chi2)
         if asks:
             is_left(tree, share)
-
-    def _check_determined(self) -> str:
-        """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
-        suspects = find_undetermined(self._graph, self._mark)
-        if not suspects.size:
-            return ""
-        free = find_unanchored(self._graph, self._mark)
-        system = self._system(self._apart())
-        if free >= 0:
-            raise system.underconstrained(
-                free,
-                "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to the "
-                "rest of the map",
-            )
-        system.begin(suspects, Stopwatch(None))
-        system.factorize(0.0)
-        return f"only several factors together hold {counted(suspects.size, 'new variable')}"
 
     def _complete(self, settle: bool, because: str, escaped: bool, bounded: bool) -> tuple[Minimization | None, str]:
         """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
