@@ -72,12 +72,14 @@ def missed_error_se3(graph: Graph, tree: Tree, f: int, seen: tuple) -> tuple[flo
     if row[tl.E_FORM] >= tl.CORRECTED:
         b0, b1, b2 = b0 - row[tl.E_MISSED], b1 - row[tl.E_MISSED + 1], b2 - row[tl.E_MISSED + 2]
         b3, b4, b5 = b3 - row[tl.E_MISSED + 3], b4 - row[tl.E_MISSED + 4], b5 - row[tl.E_MISSED + 5]
+    turned = b3 * (p[k + 15] * b3 + 2.0 * (p[k + 16] * b4 + p[k + 17] * b5))
+    turned += b4 * (p[k + 18] * b4 + 2.0 * p[k + 19] * b5) + b5 * p[k + 20] * b5
+    if row[tl.E_FORM] == tl.ISOTROPIC or row[tl.E_FORM] == tl.ISOTROPIC + tl.CORRECTED:
+        return math.sqrt(max(p[k] * (b0 * b0 + b1 * b1 + b2 * b2) + turned, 0.0)), shift, psi
     total = b0 * (p[k] * b0 + 2.0 * (p[k + 1] * b1 + p[k + 2] * b2 + p[k + 3] * b3 + p[k + 4] * b4 + p[k + 5] * b5))
     total += b1 * (p[k + 6] * b1 + 2.0 * (p[k + 7] * b2 + p[k + 8] * b3 + p[k + 9] * b4 + p[k + 10] * b5))
     total += b2 * (p[k + 11] * b2 + 2.0 * (p[k + 12] * b3 + p[k + 13] * b4 + p[k + 14] * b5))
-    total += b3 * (p[k + 15] * b3 + 2.0 * (p[k + 16] * b4 + p[k + 17] * b5))
-    total += b4 * (p[k + 18] * b4 + 2.0 * p[k + 19] * b5) + b5 * p[k + 20] * b5
-    return math.sqrt(max(total, 0.0)), shift, psi
+    return math.sqrt(max(total + turned, 0.0)), shift, psi
 
 
 @inline_kernel

@@ -59,10 +59,10 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     """Take in what is new in the graph, and solve.  graph_table, tree_table: of their arrays (`records`); queue: for
     worker threads (`task_queue`); worker: NOBODY, or this is a worker thread (`run_tasks`).
 
-    Gives DONE, or CLEAR; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
-    the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
-    or FAILED: the pivot of S_FAILED was not positive; or INFINITE: the χ² of a new factor is beyond numbers.  After
-    the last two the tree is as it was before the step.
+    Gives DONE, or CLEAR; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or
+    UNSURE: only the numbers can tell whether all new variables are held, and the step begins when it is called with
+    S_CHECKED set; or FAILED: the pivot of S_FAILED was not positive; or INFINITE: the χ² of a new factor is beyond
+    numbers.  After the last two the tree is as it was before the step.
     """
     if worker != NOBODY:
         run_tasks(queue, worker)
