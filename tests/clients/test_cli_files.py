@@ -148,6 +148,23 @@ def test_a_trajectory_for_each_robot(folder: Path, capsys: pytest.CaptureFixture
     assert main(["convert", "ab.g2o", "c.g2o", "--robot", "a"]) == USAGE
 
 
+def test_two_robots_of_3_m_are_no_trajectory_of_200(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """a0 a2 a4 a6 and b1 b3 b5 b7, 100 m apart: one through all, by their numbers, has 697 m."""
+    lines = []
+    for letter, first, y in (("a", 0, 0), ("b", 1, 100)):
+        lines += [f"VERTEX_SE2 {symbol(letter, first + 2 * k)} {k} {y} 0" for k in range(4)]
+    (folder / "ab.g2o").write_text("\n".join(lines) + "\n")
+    for form, columns in (("tum", slice(1, 3)), ("kitti", slice(3, 8, 4))):
+        assert main(["convert", "ab.g2o", f"out.{form}"]) == OK
+        assert not (folder / f"out.{form}").exists()
+        for robot, y in (("a", 0.0), ("b", 100.0)):
+            rows = np.loadtxt(folder / f"out-{robot}.{form}")[:, columns]
+            assert np.linalg.norm(np.diff(rows, axis=0), axis=1).sum() == pytest.approx(3.0)
+            assert rows[:, 1].tolist() == [y] * 4
+        if form == "tum":
+            assert np.loadtxt(folder / "out-b.tum")[:, 0].tolist() == [1, 3, 5, 7]
+
+
 @pytest.mark.parametrize(
     ("text", "target", "said"),
     [

@@ -14,6 +14,7 @@ from naive.dense_least_squares import DenseGraph, rho
 
 from factorbus.proto import asking_codec as asked
 from factorbus.proto import codec
+from factorbus.proto.kinds import LOSSES
 from factorbus.proto.messages import Accepted, Delta, Estimate, MapGraph
 
 ROOT = Path(__file__).parents[2] / "proto" / "vectors"
@@ -130,3 +131,36 @@ def test_a_marginal_says_what_it_stands_for() -> None:
     assert any(kind.startswith("linear") for kind, *_ in marginal.factors)
     known = DenseCovariance(marginal)
     check_blocks(asked.decode_covariances(read("covariances_marginal")).groups, known, rtol=1e-6, atol=1e-10)
+
+
+def test_every_message_that_a_client_meets_is_among_the_vectors() -> None:
+    """Those that a client's author had missed: each has what he looked for in it."""
+    assert asked.decode_why(read("why_variable")).variable["factors"]
+    assert codec.decode_delta(read("delta")).previous == 0
+    graph = codec.decode_graph(read("graph")).batch.factors
+    assert {group.loss for group in graph} == {"", "huber", "geman-mcclure"}
+    assert any(group.kind.startswith("linear_") for group in codec.decode_graph(read("graph_marginal")).batch.factors)
+    losses = codec.decode_insert((ROOT / "insert_losses.msgpack").read_bytes()).batch.factors
+    assert {group.loss for group in losses} == set(LOSSES)
+    assert not codec.decode_accepted((ROOT / "accepted_without_report.msgpack").read_bytes()).report
+    row, maps = codec.decode_map(read("row")), codec.decode_map(read("admin_maps"))
+    assert set(row) >= {"name", "mode", "epoch", "revision", "variables", "factors", "state", "converged", "protocol"}
+    assert [each["name"] for each in maps["maps"]] == [row["name"]]
+    assert {"service", "version", "maps", "workers", "memory"} <= set(codec.decode_map(read("admin_stats")))
+    assert {"clients", "inserts", "steps", "options", "converging"} <= set(codec.decode_map(read("stats")))
+
+
+def test_the_export_is_of_the_estimate() -> None:
+    export = codec.decode_map(read("export"))
+    assert (set(export), export["format"]) == ({"epoch", "revision", "format", "text", "notes"}, "tum")
+    poses = {
+        key & 0xFFFF: row
+        for group in codec.decode_estimate(read("estimate")).variables
+        if group.kind == "se2"
+        for key, row in zip(group.keys.tolist(), group.values, strict=True)
+    }
+    rows = [[float(word) for word in line.split()] for line in export["text"].splitlines()]
+    assert sorted(int(row[0]) for row in rows) == sorted(poses)
+    for number, x, y, z, *q in rows:
+        np.testing.assert_allclose([x, y, 2 * np.arctan2(q[2], q[3])], poses[int(number)], atol=1e-12)
+        assert (z, q[0], q[1]) == (0.0, 0.0, 0.0)

@@ -164,6 +164,22 @@ def test_a_client_long_silent_makes_room(admission: Admission) -> None:
     assert codes(admission.admit(arrived("e", 1, now=701.0))) == ["too_large"]
 
 
+def test_of_one_sender_256_names_have_their_places_and_the_257th_makes_room_among_its_own() -> None:
+    """What follows the last `-` is the suffix: a name is that of a sender up to there."""
+    admission = Admission(EPOCH, Limits())
+    others = [f"{name}-1" for name in "abc"]
+    for now, client in enumerate([*others, *(f"rob-ot-{n:08x}" for n in range(256))]):
+        assert codes(admission.admit(arrived(client, 1, now=float(now)))) == []
+    assert codes(admission.admit(arrived("rob-ot-more", 1, now=300.0))) == ["too_large"], "all have something open"
+    assert codes(admission.admit(arrived("rob-other", 1, now=300.0))) == [], "rob is another sender"
+    for insert in admission.take(999):
+        admission.answer(insert, b"")
+    assert codes(admission.admit(arrived("rob-ot-more", 1, now=301.0))) == []
+    assert {*others, "rob-ot-more", "rob-other", "rob-ot-00000001"} <= set(admission.next_sequences)
+    assert "rob-ot-00000000" not in admission.next_sequences, "the one heard of longest ago"
+    assert len(admission.next_sequences) == 3 + 256 + 1
+
+
 def test_closing_keeps_what_was_admitted(admission: Admission) -> None:
     admission.admit(arrived("a", 1))
     admission.admit(arrived("a", 3))

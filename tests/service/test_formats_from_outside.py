@@ -18,7 +18,7 @@ MODES = ("bayes-tree", "inc-l", "inc-l-b10", "all-batch")
 # χ² at the optimum; what the reader says, a part of each note
 CASES: dict[str, tuple[float, tuple[str, ...]]] = {
     "bearing_only.g2o": (39.62495095, ()),
-    # g2o 2.3 takes the camera for the sensor, unchecked, and predicts (z, 0, 0): its 2.33 of this file means nothing.
+    # g2o ends at 2.334492698, with predictions that are no one's: see the test below.
     "cam.g2o": (0.00267980137, ("1 PARAMS_CAMERACALIB left out",)),
     "gtsam_symbols.g2o": (0.006274534633, ()),
     "id_labeled.g2o": (LOOP, ()),
@@ -64,6 +64,32 @@ def test_it_says_what_it_read_and_the_batch_optimum_is_right(name: str) -> None:
     if graph.left_out:
         with pytest.raises(FormatError, match="strict"):
             read(FOLDER / name, strict=True)
+
+
+def test_what_g2o_makes_of_a_camera_and_an_offset_with_one_number_is_its_own(tmp_path: Path) -> None:
+    """Both parameters of cam.g2o are number 0: g2o 2.3 keeps the camera and takes its memory for that of an offset.
+
+    Of a point at (2, 1, 0) it predicts (0, 0, 0) from the origin; without the camera it ends where we end with it.
+    """
+    g2o = pytest.importorskip("g2opy")
+
+    def chi2(text: str) -> tuple[float, float]:
+        """At the file's values, and where g2o ends."""
+        (tmp_path / "a.g2o").write_text(text)
+        graph = g2o.SparseOptimizer()
+        graph.set_algorithm(g2o.OptimizationAlgorithmLevenberg(g2o.BlockSolverX(g2o.LinearSolverEigenX())))
+        graph.load(str(tmp_path / "a.g2o"))
+        graph.initialize_optimization()
+        graph.compute_active_errors()
+        begins = graph.active_chi2()
+        graph.optimize(50)
+        graph.compute_active_errors()
+        return begins, graph.active_chi2()
+
+    text = (FOLDER / "cam.g2o").read_text()
+    assert chi2(text) == pytest.approx((2**2 + 1 + 1.1**2 + 1, 2.334492698), rel=1e-8)
+    alone = "".join(line for line in text.splitlines(keepends=True) if not line.startswith("PARAMS_CAMERACALIB"))
+    assert chi2(alone) == pytest.approx((0.1**2, CASES["cam.g2o"][0]), rel=1e-8)
 
 
 @pytest.mark.parametrize("mode", MODES)

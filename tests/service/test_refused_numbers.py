@@ -39,6 +39,8 @@ BROKEN: dict[str, Callable[[dict], bytes]] = {
     "a key that is an array": lambda m: _with(m, b"\x91\x01", b"\x01"),
     "nested without end": lambda m: _with(m, b"\xa1x", b"\x91" * 5000 + b"\xc0"),
     "a thousand groups": lambda m: msgpack.packb(m | {"variables": [{}] * 1000}),
+    "257 elements": lambda m: msgpack.packb(m | {"x": [0] * 257}),
+    "5,000 arrays": lambda m: msgpack.packb(m | {"x": [[[0] * 250] * 250] * 20, "y": bytes(70_000)}),
     "a million arrays": lambda m: msgpack.packb(m | {"x": [[[[]] * 200] * 200] * 25}),
     "an epoch that is none": lambda m: msgpack.packb(m | {"epoch": "seven"}),
     "an epoch of 2^63": lambda m: msgpack.packb(m | {"epoch": 2**63}),

@@ -1,12 +1,18 @@
 """Who sends inserts: taken apart once, known to Zenoh as long as there is room."""
 
 import threading
+from contextlib import closing
 
 import pytest
 
+from factorbus.client import Draft, connect
 from factorbus.proto.keys import insert_key
 from factorbus.proto.problems import Problem
+from factorbus.service.app import Shell
 from factorbus.service.bus.senders import Senders
+from factorbus.service.bus.zenoh_config import RUNTIME, RUNTIME_VARIABLE
+from factorbus.service.bus.zenoh_session import open_service_bus
+from factorbus.service.config import Config
 from factorbus.service.maps.serial_executor import SerialExecutor
 
 
@@ -85,3 +91,37 @@ def test_who_made_room_can_come_back():
     senders.remember(a, senders.find(a))
     control.close()
     assert declared.now == [a]
+
+
+def test_who_sent_to_a_map_that_was_dropped_is_forgotten_and_nobody_else():
+    """Their keys took 4 kB each of a service whose maps come and go, until 4096 of them were known."""
+    control, declared = SerialExecutor("control"), Declared()
+    senders = Senders(control, declared.declare)
+    gone = [insert_key("m", client) for client in ("a", "b")]
+    other, again = insert_key("m2", "a"), gone[0]
+    for key in (*gone, other):
+        senders.remember(key, senders.find(key))
+    control.hand(senders.forget, "m")
+    settle(control)
+    assert declared.now == [other]
+    senders.remember(again, senders.find(again))
+    control.close()
+    assert declared.now == [other, again], "a map of that name may come again"
+
+
+def test_a_service_forgets_them_with_their_map(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(RUNTIME_VARIABLE, RUNTIME)  # which it would set
+    config = Config(listen=("tcp/127.0.0.1:0",), warm=False)
+    with (
+        closing(open_service_bus(config)) as bus,
+        closing(Shell(bus, config)) as shell,
+        connect(bus.endpoints()[0], client="robot", timeout_s=60) as robot,
+    ):
+        for name in ("m", "other"):
+            robot.map(name, mirror=False).insert(Draft().se2("x0", (0, 0, 0), fixed=True))
+        settle(shell._control)
+        assert {key.split("/")[3] for key in shell._senders._forget} == {"m", "other"}
+        robot.drop("m")
+        settle(shell._control)
+        assert [key.split("/")[3] for key in shell._senders._forget] == ["other"]
+        assert not any("/map/m/" in key for key in shell._senders._found)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from naive.solver_parts import graph_in, stepper_in, system_in
 from scipy.spatial.transform import Rotation
-from solver.test_converged import put
+from solver.test_converged import finish, put, rig_drive
 from solver.test_decrement import drive_of, normal_equations
 
 from factorbus.client import Draft
@@ -90,6 +90,14 @@ def test_every_step_comes_to_the_optimum(mode: str, stiff: float, prior: float, 
     while solver.unfinished:
         solver.step()
     assert solver.chi2() == pytest.approx(plain.step(settle=True).chi2, rel=1e-4)
+
+
+@pytest.mark.parametrize("stiff", [1e-5, 1e-6, 1e-7])
+def test_two_thousand_poses_with_a_second_one_on_every_tenth_are_taken_to_the_batch_optimum(stiff: float) -> None:
+    """Behind a prior of variance 1e10; a link that contradicts nothing adds nothing to the optimum of the drive."""
+    solver = rig_drive(stiff, 2000)
+    finish(solver)
+    assert solver.chi2() == pytest.approx(134.313023, rel=1e-6)
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -57,6 +57,29 @@ def test_an_outlier_tells_its_residual_and_what_it_counts_apart(loss: str) -> No
     assert 0.0 <= explained.weight < 0.11
 
 
+# Of two of σ = 0.4 m that are 4 m apart, where one has the loss: what was told of it, and what the map falls by.
+FRONT_END = {"huber": (10.0, 18.0), "cauchy": (1.0, 4.6), "tukey": (0.0, 0.33), "dcs": (0.04, 2.96)}
+
+
+@pytest.mark.parametrize("loss", FRONT_END)
+def test_one_that_is_held_no_firmer_than_it_pulls_is_not_told_as_the_linear_model_has_it(loss: str) -> None:
+    key, weight = np.array([[symbol("l", 1)]]), UNIT / 0.4**2
+    near = Factors("prior_point2", key, np.zeros((1, 2)), weight)
+    far = near._replace(measured=np.array([[4.0, 0.0]]), loss=loss, scale=np.ones(1))
+    solver = Solver()
+    solver.stage(Batch((Variables("point2", key[0], np.zeros((1, 2))),), (near, far)))
+    solver.step(settle=True)
+    explained, (linear, true) = why(solver, 1), FRONT_END[loss]
+    assert explained.without == pytest.approx(fall(solver, 1), rel=1e-7)
+    assert explained.without == pytest.approx(true, rel=0.015)
+    weighted = explained.weight * explained.chi2
+    leverage = explained.weight / (1.0 + explained.weight)
+    assert weighted / (1.0 - leverage) == pytest.approx(linear, rel=0.02, abs=1e-9)
+    # Nothing is weighted of what it measures: 4 m less what it has moved the point.
+    assert explained.residual[0] * 2.5 == pytest.approx(-np.sqrt(explained.chi2), rel=1e-9)
+    assert explained.chi2 >= 81.0 - 1e-6
+
+
 @pytest.mark.parametrize("loss", ["", *OUTLIER])
 @pytest.mark.parametrize("apart", [0.3, 2.0, 4.0])
 def test_without_is_what_solving_again_gains(loss: str, apart: float) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from bare import bare, start
 from journalled import Services, drafts
 
 from factorbus.cli.doctor.service_checks import services as look_at
@@ -16,6 +17,7 @@ from factorbus.client import Problem, Refused, connect
 from factorbus.client.bus import Bus
 from factorbus.journal.store import NAME
 from factorbus.proto import codec, keys
+from factorbus.proto.messages import Insert
 
 Ran = "subprocess.CompletedProcess[str]"
 
@@ -43,6 +45,14 @@ def code_of(call: Callable[[], object]) -> tuple[str, str]:
     with pytest.raises(Problem) as refused:
         call()
     return refused.value.code, str(refused.value)
+
+
+def refused_insert(endpoint: str) -> tuple[str, int]:
+    """Its code, and the number that is wanted next, of an insert of a client that was there before."""
+    with bare(endpoint) as client:
+        came = client.ask(keys.insert_key("m", "before-1"), codec.encode_insert(Insert(1, start())))
+    assert isinstance(came, Refused)
+    return came.code, came.detail["next"]
 
 
 def test_a_damaged_map_can_be_seen_and_given_up(services: Callable[..., Services], tmp_path: Path) -> None:
@@ -76,6 +86,7 @@ def test_a_damaged_map_can_be_seen_and_given_up(services: Callable[..., Services
         for call in (lambda: bus.map("m"), lambda: bus.drop("m"), lambda: bus.map("m", create=False)):
             code, text = code_of(call)
             assert (code, "--damaged" in text) == ("journal_damaged", True)
+        assert refused_insert(endpoint) == ("journal_damaged", 1), "its number is not used up"
         code, text = code_of(lambda: bus.fork("hall", "m"))
         assert (code, "`factorbus drop m --damaged` gives it up" in text) == ("map_exists", True)
 
@@ -149,7 +160,9 @@ def test_a_form_that_is_not_ours_is_another_state(services: Callable[..., Servic
     with sqlite3.connect(tmp_path / "journal" / "m" / NAME) as database:
         database.execute("PRAGMA user_version = 99")
     database.close()
-    with connect(service.start(), client="after", timeout_s=60) as bus:
+    endpoint = service.start()
+    assert refused_insert(endpoint) == ("journal_version", 1), "its number is not used up"
+    with connect(endpoint, client="after", timeout_s=60) as bus:
         (row,) = bus.maps()
         assert (row.name, row.state) == ("m", "other_version")
         bus.drop("m", damaged=True)
@@ -158,8 +171,6 @@ def test_a_form_that_is_not_ours_is_another_state(services: Callable[..., Servic
 
 
 def test_the_message_says_what_is_wrong_with_itself(endpoint: str) -> None:
-    from bare import bare
-
     with bare(endpoint) as client:
         for asked in ({"map": "m", "damaged": 1}, {"map": "m", "damaged": "yes"}):
             came = client.ask(keys.admin_key("drop"), codec.encode_map(asked))

@@ -109,6 +109,9 @@ def test_what_cannot_be_forked_is_refused_and_changes_nothing(
         for source in ("lab-x", "hall"):
             with pytest.raises(UnknownMap):
                 bus.fork(source, "lab-b")
+        with pytest.raises(Refused, match="'hall' is not one of them") as refused:
+            bus.create("hall")
+        assert refused.value.code == "unknown_map"
         with pytest.raises(BadName):
             bus.fork("lab-a", "no/name")
         first = bus.fork("lab-a", "lab-b")

@@ -149,6 +149,7 @@ class Shell:
         self._delivery.interests = Interests(config.limits, self.health_report.memory, self._delivery)
         self.health_report.chapters["interests"] = self._delivery.interests.rows
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._control, self.health_report.memory)
+        self.maps.on_gone = self._senders.forget
         stats, at_router = self.health_report.read, bool(config.connect)
         self._administration = Administration(self._service, self.maps, self._delivery, stats, at_router)
         self.health_report.chapters["protocol"] = known

@@ -84,6 +84,7 @@ class Maps:
         self._stopping = False
         self._inline_run = threading.Lock()  # of the one callback that may solve
         self._maker = MapMaker(config, library)
+        self.on_gone: Callable[[str], None] = lambda _: None  # what else there is of a map that was dropped
 
     def get(self, name: str) -> OpenMap | None:
         """Map `name`, if it is here."""
@@ -368,6 +369,7 @@ class Maps:
         name = found.host.core.name
         self._leaving.remove(found)
         found.host.end(keep=False)
+        self.on_gone(name)
         self._delivery.outbox.hand(found.place.close)  # behind the map's last publications
         self._control.hand(give_back)
         if self._library is not None:

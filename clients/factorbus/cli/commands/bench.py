@@ -12,7 +12,7 @@ from factorbus.cli.output.exits import FAILED, OK, Stopped
 from factorbus.cli.process.options import json_option
 
 BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
-LONG = ("every-step", "paper", "peers", "fuzz", "soak", "lifelong")  # hours (the last three: less than one); on request
+LONG = ("every-step", "paper", "peers", "fuzz", "soak", "mixed", "lifelong")  # hours (the last four: less than one)
 ASKED = (
     "aligning",
     "ask",
@@ -58,6 +58,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     journal    inserts a second with each durability, in turn, at a window of 32; --folder: on the disk to measure
     soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;
                --inserts, --minutes
+    mixed      six clients that insert, ask, change, fork and drop at once: memory and files, twenty minutes, and a
+               service that is killed: the same bits again; --minutes, --clients
     lifelong   100,000 poses round a square, in a map that keeps some and tests its loop closures, of which some are
                false, and a service that is killed 20 times: size, memory, lost, the same bits again; --steps, --false
     digest     the report of every step and the bits of every estimate, as digests; --out FOLDER, --against FOLDER

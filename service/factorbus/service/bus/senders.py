@@ -36,6 +36,13 @@ class Senders:
             self._found[key] = sender
             self._control.hand(self._make_known, key)
 
+    def forget(self, name: str) -> None:
+        """Map `name` is no more, and who sent to it sends nothing.  On the control thread."""
+        for key in [key for key, (of, _) in list(self._found.items()) if of == name]:
+            self._found.pop(key, None)
+            if key in self._forget:
+                self._forget.pop(key)()
+
     def _make_known(self, key: str) -> None:
         if key in self._forget:
             return
