@@ -13,7 +13,8 @@ from naive.tree_records import tree_of
 from factorbus.simulate import manhattan
 from factorbus.solver import Group, Options, Solver, errors
 from factorbus.solver.bayes_tree.tree import CliqueTree
-from factorbus.solver.graph.factor_graph import FactorGraph, roomy
+from factorbus.solver.graph.arenas import roomy
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.model import layout as at
 
 GRAPH = {"keys": 1, "var": 1, "dims": 1, "stamps": 1, "values": 7, "fac": 1, "payload": 28}

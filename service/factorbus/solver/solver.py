@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from factorbus.solver.graph.columns import Columns
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import BatchLike, FactorGroup, Group
 from factorbus.solver.graph.own_kinds import check_new_kinds
-from factorbus.solver.inc_l.steps import STATE_TYPES, IncrementalSteps
+from factorbus.solver.inc_l.steps import VALUE_TYPES, IncrementalSteps
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.sparse.fronts import LANES
@@ -31,7 +30,6 @@ from factorbus.solver.state import State, dump, load
 from factorbus.solver.stepper import Stepper
 
 _LANES = "lanes"
-_VALUES = MappingProxyType({kind.__name__: kind for kind in STATE_TYPES})
 
 
 class Solver:
@@ -184,9 +182,9 @@ class Solver:
         """
         parts = dict(state)
         if parts.pop(_LANES, LANES) == LANES:
-            load(self, parts, _VALUES)
+            load(self, parts, VALUE_TYPES)
             return None
-        load(self._graph, parts["_graph"], _VALUES)
+        load(self._graph, parts["_graph"], VALUE_TYPES)
         return self._stepper.resume(False)
 
     def _taken_over(self, graph: FactorGraph) -> "Solver":

@@ -34,7 +34,7 @@ def dump(thing: Any) -> State:
     """The state of `thing`, a copy.  Raises TypeError for an attribute that no state can hold."""
     used = thing.in_use() if hasattr(thing, "in_use") else {}
     return {
-        name: _dumped(value[: used[name]] if name in used else value, f"{type(thing).__name__}.{name}")
+        name: _dumped(value[used[name]] if name in used else value, f"{type(thing).__name__}.{name}")
         for name, value in _kept(thing)
     }
 

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from factorbus.solver.graph import pages
-from factorbus.solver.graph.arenas import Arenas, lines
-from factorbus.solver.graph.factor_graph import FactorGraph, roomy, with_room
+from factorbus.solver.graph.arenas import Arenas, lines, roomy, with_room
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree import records
 from factorbus.solver.kernels.bayes_tree.add_to_tree import SAVED
@@ -166,9 +166,15 @@ class CliqueTree(Arenas):
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
 
-    def in_use(self) -> dict[str, int]:
-        """Of the arenas that are by far the largest, how many entries a copy needs."""
-        return {"numbers": int(self.state[tl.S_NUMBERS]), "hessian": int(self.state[tl.S_HESSIAN])}
+    def in_use(self) -> dict[str, slice | tuple[slice, slice]]:
+        """What a copy needs of the arenas that grow with the graph, and of those that are by far the largest."""
+        entries, counts = (tl.S_VARIABLES, tl.S_FACTORS, tl.S_NUMBERS, tl.S_HESSIAN), self._graph.counts
+        variables, factors, numbers, hessian = (slice(int(self.state[entry])) for entry in entries)
+        values, scalars = (slice(int(counts[entry])) for entry in (at.VALUES, at.SCALARS))
+        together = dict.fromkeys(("node", "turns", "pending", "changed", "moved"), variables)
+        of_graph = together | {"lin": (slice(None), values), "scalars": (slice(None), scalars)}
+        of_factors = {"link": factors, "factor_errors": factors, "saved": slice(0)}
+        return of_graph | of_factors | {"numbers": numbers, "hessian": hessian}
 
     def make_room(self) -> None:
         self._make_room_for_graph()

@@ -8,7 +8,8 @@ measured of it.  What goes is the tie to the anchor and the first guess of the d
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph.factor_graph import FactorGraph, table_size
+from factorbus.solver.graph.arenas import slots_of
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import losses_of, rows_of_factors
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.key_table import enter_keys
@@ -82,7 +83,7 @@ def with_points(graph: FactorGraph, features: I64) -> FactorGraph:
     made.keys, made.var, made.values, made.fac, made.payload = graph.keys[:variables].copy(), var, values, fac, payload
     made.dims = np.zeros(variables, np.int64)
     made.dims[: np.count_nonzero(free)] = dims[free]
-    made.table = np.zeros(max(table_size(variables), 64), np.int64)
+    made.table = np.zeros(slots_of(variables), np.int64)
     enter_keys(variables, made.table, made.keys)
     made.counts[[at.VARIABLES, at.FACTORS, at.VALUES]] = variables, factors, values.size
     made.counts[at.MEMBERS] = graph.counts[at.MEMBERS]

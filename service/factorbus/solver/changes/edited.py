@@ -6,7 +6,8 @@ Nothing of the old graph is touched, so a change that turns out to be impossible
 import numpy as np
 
 from factorbus.solver.changes.requested import Edits
-from factorbus.solver.graph.factor_graph import FactorGraph, table_size
+from factorbus.solver.graph.arenas import slots_of
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, with_losses
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.key_table import enter_keys
@@ -27,7 +28,7 @@ def edited(graph: FactorGraph, edits: Edits) -> FactorGraph:
     columns = _number_columns(made, edits.free[stays])
     _pack_payload(graph, made, kept, edits)
     _renumber_ends(made, edits)
-    made.table = np.zeros(max(table_size(max(stays.size, 1)), 64), np.int64)
+    made.table = np.zeros(slots_of(stays.size), np.int64)
     enter_keys(stays.size, made.table, made.keys)
     made.counts[[at.VARIABLES, at.FACTORS, at.VALUES]] = stays.size, kept.size, made.values.size
     made.counts[[at.PAYLOAD, at.COLUMNS, at.SCALARS]] = made.payload.size, columns, made.dims[:columns].sum()

@@ -12,7 +12,8 @@ import numpy as np
 from factorbus.solver.closures.choosing import IMPROBABLE, RIVAL, ClosureOdds
 from factorbus.solver.closures.motions import motions_of_poses
 from factorbus.solver.errors import SolverError
-from factorbus.solver.graph.factor_graph import FactorGraph, with_room
+from factorbus.solver.graph.arenas import with_room
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import FactorGroup, FactorsLike
 from factorbus.solver.kernels.closures.ahead import enter_judged
 from factorbus.solver.kernels.jit.compile import F64, I64

@@ -8,6 +8,8 @@ from factorbus.solver.kernels.jit.array_table import WIDTH
 from factorbus.solver.kernels.jit.compile import I64
 
 _LINE = 64  # bytes of a cache line
+_LEAST_SLOTS = 1024
+_MUCH = 4096  # rows
 
 
 def lines(shape: int | tuple[int, ...], kind: type[np.generic] | np.dtype[Any]) -> np.ndarray:
@@ -19,6 +21,32 @@ def lines(shape: int | tuple[int, ...], kind: type[np.generic] | np.dtype[Any]) 
     raw = np.zeros(size + 2 * _LINE, np.uint8)
     skip = -raw.ctypes.data % _LINE
     return raw[skip : skip + size].view(kind).reshape(shape)
+
+
+def with_room(array: np.ndarray, need: int) -> np.ndarray:
+    """A copy with room for at least `need` rows, and more for the next ones; the new room is zero."""
+    larger = lines((roomy(need, len(array)), *array.shape[1:]), array.dtype)
+    larger[: len(array)] = array
+    return larger
+
+
+def roomy(need: int, size: int) -> int:
+    """How long to make an array of `size` that is to have `need`: four times what it is, or twice if that is much.
+
+    To find that there is no room, and begin again, takes longer than to copy a few pages.  It does not look at how wide
+    rows are: arrays with a row for each of the same things, and as long, stay as long as each other.
+    """
+    return max(need, (4 if size < _MUCH else 2) * size)
+
+
+def table_size(entries: int) -> int:
+    """Slots of a hash table that is to hold `entries` and grow further: a power of two, a quarter full or less."""
+    return 1 << (4 * entries - 1).bit_length()
+
+
+def slots_of(variables: int) -> int:
+    """Slots of a table of keys: half full or less, and of one size with as many variables, however they came."""
+    return max(_LEAST_SLOTS, 1 << (2 * variables - 1).bit_length())
 
 
 class Arenas:

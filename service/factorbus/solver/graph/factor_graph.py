@@ -16,7 +16,7 @@ import numpy as np
 from factorbus.proto import inertial
 from factorbus.solver.errors import printed
 from factorbus.solver.formulas.own_code import own_code_of
-from factorbus.solver.graph.arenas import Arenas, lines
+from factorbus.solver.graph.arenas import Arenas, lines, roomy, slots_of, with_room
 from factorbus.solver.graph.factor_rows import (
     arities_of,
     ends_of_rows,
@@ -47,7 +47,6 @@ from factorbus.solver.kernels.model.retract import common_label, gather_values
 
 Mark: TypeAlias = tuple[int, ...]
 
-_MUCH = 4096  # rows
 # By the code of a kind; the last are of members, and of families, whose sizes are each factor's own.
 _NO_SIZE = (0,) * at.FURTHER_CODES
 _MEASURED = np.array([*(FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_KIND_OF_CODE)), *_NO_SIZE], np.int64)
@@ -68,13 +67,13 @@ class FactorGraph(Arenas):
         # Room for the first few hundred factors: the step that finds none takes several times as long.
         self.keys: I64 = np.empty(256, np.int64)
         self.var: I64 = lines((256, at.V_WIDTH), np.int64)
-        self.dims: I64 = np.empty(256, np.int64)
+        self.dims: I64 = np.zeros(256, np.int64)
         self.stamps: I64 = np.empty(256, np.int64)
         self.values: F64 = np.zeros(1024)
         self.fac: I64 = lines((512, at.F_WIDTH), np.int64)
         self.payload: F64 = np.empty(8192)
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
-        self.table: I64 = np.zeros(1024, np.int64)
+        self.table: I64 = np.zeros(slots_of(0), np.int64)
         # No keys yet: it loads the kernel, which the step that needs a larger table would have to wait for.
         enter_keys(0, self.table, self.keys)
         self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`
@@ -103,7 +102,11 @@ class FactorGraph(Arenas):
 
     def forget(self, mark: Mark) -> None:
         """Go back to `mark`."""
-        remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
+        if (slots := slots_of(mark[at.VARIABLES])) < self.table.size:
+            self._enter_keys(mark[at.VARIABLES], slots)
+        else:
+            remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
+        self.dims[mark[at.COLUMNS] : self.counts[at.COLUMNS]] = 0
         self.counts[:] = mark
         self.forget_ids()
         if self._rows.forget(mark[at.VARIABLES]):
@@ -142,9 +145,8 @@ class FactorGraph(Arenas):
             self.keys, self.var, self.dims, self.stamps = (with_room(array, need) for array in together)
         if (need := counts[at.VALUES] + numbers) > self.values.size:
             self.values = with_room(self.values, need)
-        if 2 * (counts[at.VARIABLES] + more) > self.table.size:
-            self.table = np.zeros(table_size(counts[at.VARIABLES] + more), np.int64)
-            enter_keys(counts[at.VARIABLES], self.table, self.keys)
+        if (slots := slots_of(counts[at.VARIABLES] + more)) > self.table.size:
+            self._enter_keys(counts[at.VARIABLES], slots)
 
     def reserve_factors(self, more: int, numbers: int) -> None:
         """Make room for `more` rows of factors and all numbers of these (measurement, information, scale of a loss)."""
@@ -153,6 +155,17 @@ class FactorGraph(Arenas):
             self.fac = with_room(self.fac, need)
         if (need := counts[at.PAYLOAD] + numbers) > self.payload.size:
             self.payload = with_room(self.payload, need)
+
+    def in_use(self) -> dict[str, slice]:
+        """What of each arena a copy needs: what is behind that may be of a batch that was refused."""
+        variables, factors, values, payload, *_ = (slice(count) for count in self.counts.tolist())
+        of_variables = dict.fromkeys(("keys", "var", "stamps", "dims"), variables)
+        return of_variables | {"values": values, "fac": factors, "payload": payload}
+
+    def _enter_keys(self, variables: int, slots: int) -> None:
+        """A new table of the first variables."""
+        self.table = np.zeros(slots, np.int64)
+        enter_keys(variables, self.table, self.keys)
 
     def take(self, other: "FactorGraph") -> None:
         """Become `other`."""
@@ -376,24 +389,3 @@ def _shape(group: I64) -> tuple[int, int]:
         return int(group[gt.G_ARITY]), before + rows * (rows + 1) // 2
     kind = FACTOR_KIND_OF_CODE[code]
     return len(kind.connects), kind.width
-
-
-def with_room(array: np.ndarray, need: int) -> np.ndarray:
-    """A copy with room for at least `need` rows, and more for the next ones; the new room is zero."""
-    larger = lines((roomy(need, len(array)), *array.shape[1:]), array.dtype)
-    larger[: len(array)] = array
-    return larger
-
-
-def roomy(need: int, size: int) -> int:
-    """How long to make an array of `size` that is to have `need`: four times what it is, or twice if that is much.
-
-    To find that there is no room, and begin again, takes longer than to copy a few pages.  It does not look at how wide
-    rows are: arrays with a row for each of the same things, and as long, stay as long as each other.
-    """
-    return max(need, (4 if size < _MUCH else 2) * size)
-
-
-def table_size(entries: int) -> int:
-    """Slots of a hash table that is to hold `entries` and grow further: a power of two, a quarter full or less."""
-    return 1 << (4 * entries - 1).bit_length()

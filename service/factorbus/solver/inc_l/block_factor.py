@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorbus.solver.graph.arenas import Arenas
-from factorbus.solver.graph.factor_graph import FactorGraph, with_room
+from factorbus.solver.graph.arenas import Arenas, with_room
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.inc_l import block_rows as br
 from factorbus.solver.kernels.inc_l.block_rows import (
     append_rows,

@@ -1,24 +1,29 @@
 """Steps in the modes of the 2013 paper: R is updated, or all of Λ is factorized anew.  MATH §6, §8.
 
-1  place      new variables where their own factors want them; what is new is added to Λ and η
-2  check      every new variable is held by something
-3  follow     R and d are updated, or given up
-4  solve      Gauss-Newton, if there is anything to solve
-5  report     what was done, and where this leaves things
+1  place      new variables where their own factors want them
+2  check      every new variable is held by something; where only numbers tell, Λ and R are kept as they were
+3  extend     what is new is added to Λ and η
+4  follow     R and d are updated, or given up
+5  solve      Gauss-Newton, if there is anything to solve
+6  report     what was done, and where this leaves things
 """
 
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
+from factorbus.solver.graph.factor_rows import losses_of
 from factorbus.solver.inc_l.incremental import Incremental, Where
 from factorbus.solver.inc_l.strategy import Plan
 from factorbus.solver.kernels.graph.local_init import initialize_new
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.chi2 import sum_chi2
+from factorbus.solver.kernels.model.kinds import CAMERA, OF_FAMILY
 from factorbus.solver.modes import mode_named
 from factorbus.solver.optimize.gauss_newton import Minimization, minimize, try_linear_step
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
@@ -28,6 +33,7 @@ from factorbus.solver.report import StepReport, Stopwatch
 from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
 from factorbus.solver.sparse.elimination import Elimination
 from factorbus.solver.sparse.symbolic import Symbolic
+from factorbus.solver.state import State, dump, load
 from factorbus.wording import counted
 
 # A step of a robot brings no more variables than this, and some factors each.
@@ -59,6 +65,7 @@ class _Done:
 
 # The types of values in the state of these steps.
 STATE_TYPES = (_Done, Symbolic, Where)
+VALUE_TYPES = MappingProxyType({kind.__name__: kind for kind in STATE_TYPES})
 
 
 class IncrementalSteps:
@@ -123,24 +130,31 @@ class IncrementalSteps:
     def _step(self, settle: bool, resumes: bool = False) -> StepReport:
         watch = Stopwatch(self._options.clock)
         try:
-            # 1. What is new goes to a good place; linearized there it is added to Λ and η.
+            # 1. What is new goes to a good place.
             if self._options.initialize_locally and not resumes:
                 self._place_new()
-            added = self._system.blocks.extend(self._graph, self._done.graph)
-            watch.lap("linearize")
-            # 2. Is every new variable held by something?
-            suspects = self._suspects(resumes)
+            # 2. Is every new variable held by something?  So far Λ and R are as they were.
+            suspects = self._check_new()
+            before = dump(self._system) if suspects.size or self._may_rest(resumes) else None
             watch.lap("check")
-            # 3. R and d follow.
+        except BaseException:
+            self._graph.forget(self._done.graph)
+            raise
+        try:
+            # 3. Linearized there it is added to Λ and η.
+            added = self._system.blocks.extend(self._graph, self._done.graph)
+            suspects = suspects if resumes else self._with_unweighted(suspects)
+            watch.lap("linearize")
+            # 4. R and d follow.
             plan = self._follow(suspects, watch)
-            # 4. Solve, if there is anything to solve.
+            # 5. Solve, if there is anything to solve.
             because = self._reason_to_solve(added, settle, suspects)
             batch = settle or self._goes_on or self._is_batch_due()
             result, finished = self._solve(added, settle, batch, suspects, watch) if because else self._extend(added)
         except BaseException:
-            self._take_back()
+            self._take_back(before)
             raise
-        # 5. Remember where this leaves things, and report it.
+        # 6. Remember where this leaves things, and report it.
         report = self._report(result, added, self._reported(plan, because, batch), watch)
         self._commit(result, added, bool(because), batch, finished)
         return report
@@ -153,11 +167,9 @@ class IncrementalSteps:
             variables, factors = (mark[at.VARIABLES], counts[at.VARIABLES]), (mark[at.FACTORS], counts[at.FACTORS])
             initialize_new(*variables, *factors, self._options.tuning.chi2_epsilon, self._graph.array_table)
 
-    def _suspects(self, resumes: bool) -> I64:
-        """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold.
-
-        A loss may have set aside all that is on a variable: one that is new is refused then, an old one rests.
-        """
+    def _check_new(self) -> I64:
+        """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold, and
+        NotFinite."""
         suspects = find_undetermined(self._graph, self._done.graph)
         if suspects.size:
             free = find_unanchored(self._graph, self._done.graph)
@@ -167,16 +179,27 @@ class IncrementalSteps:
                     "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to "
                     "the rest of the map",
                 )
-        if not resumes:
-            new = np.arange(self._done.graph[at.VARIABLES], int(self._graph.counts[at.VARIABLES]))
-            free = new[self._graph.var[new, at.V_COLUMN] >= 0]
-            suspects = np.union1d(suspects, self._system.blocks.unweighted(self._graph, free))
+        graph, factors = self._graph, (self._done.graph[at.FACTORS], int(self._graph.counts[at.FACTORS]))
+        if not np.isfinite(sum_chi2(*factors, graph.var, graph.fac, graph.values, graph.payload)):
+            raise errors.NotFinite("χ² of the new factors")
         return suspects
+
+    def _may_rest(self, resumes: bool) -> bool:
+        """Whether all that is on a new variable may have no weight: an observation without a pixel, or by its loss."""
+        if resumes or self._graph.counts[at.VARIABLES] == self._done.graph[at.VARIABLES]:
+            return False
+        fac = self._graph.fac[self._done.graph[at.FACTORS] : self._graph.counts[at.FACTORS]]
+        kinds = fac[:, at.F_KIND]
+        return bool((CAMERA[kinds] | OF_FAMILY[kinds] | (losses_of(fac) != at.NO_LOSS)).any())
+
+    def _with_unweighted(self, suspects: I64) -> I64:
+        """A loss may have set aside all that is on a variable: one that is new is refused then, an old one rests."""
+        new = np.arange(self._done.graph[at.VARIABLES], int(self._graph.counts[at.VARIABLES]))
+        free = new[self._graph.var[new, at.V_COLUMN] >= 0]
+        return np.union1d(suspects, self._system.blocks.unweighted(self._graph, free))
 
     def _reason_to_solve(self, added: float, settle: bool, suspects: I64) -> str:
         """Why the system is to be solved; empty: there is nothing to solve."""
-        if not np.isfinite(added):
-            raise errors.NotFinite("χ² of the new factors")
         if not self._graph.counts[at.COLUMNS]:
             return ""
         if settle:
@@ -273,9 +296,12 @@ class IncrementalSteps:
         result = Minimization(self._done.chi2 + added, damping=0.0, converged=self._done.converged)
         return result, self._done.finished
 
-    def _take_back(self) -> None:
+    def _take_back(self, before: State | None) -> None:
+        """What came since the last step was never there; before: the system then, where it was kept."""
         self._graph.forget(self._done.graph)
         self._system.take_back(self._done.fill)
+        if before is not None:
+            load(self._system, before, VALUE_TYPES)
 
     def _commit(self, result: Minimization, added: float, solved: bool, batch: bool, finished: bool) -> None:
         unsolved = self._done.unsolved + added

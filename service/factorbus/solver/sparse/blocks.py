@@ -7,7 +7,8 @@ is not accepted costs nothing to undo.
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import FactorGraph, Mark, table_size, with_room
+from factorbus.solver.graph.arenas import table_size, with_room
+from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.kernels.graph.block_pattern import connect_blocks, enter_blocks, remove_blocks
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
