@@ -11,9 +11,11 @@ DRIVES = ("manhattan", "city_trees", "sphere", "outliers", "drift", "meetings_3d
 TIMES = {"step_ms", "compiled_ms", "phases_ms"}
 
 
+@pytest.mark.parametrize("budget", [0.0, 3000.0])
 @pytest.mark.parametrize("world", DRIVES)
-def test_reports_are_the_same_with_a_closer_look(world: str) -> None:
-    clear, looked_at = Solver(Options()), Solver(Options())
+def test_reports_are_the_same_with_a_closer_look(world: str, budget: float) -> None:
+    """Also with a budget, which leaves steps unconverged."""
+    clear, looked_at = (Solver(Options(step_budget=budget)) for _ in range(2))
     converged, steps = 0, list(WORLDS[world].make(80, 4))
     for step in steps:
         reports = []
@@ -25,3 +27,4 @@ def test_reports_are_the_same_with_a_closer_look(world: str) -> None:
         assert reports[0] == reports[1]
         converged += reports[0]["converged"]
     assert 0 < converged <= len(steps)
+    assert converged < len(steps) or not budget or world in ("manhattan", "outliers", "drift")
