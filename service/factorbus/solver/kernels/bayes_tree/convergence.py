@@ -11,7 +11,6 @@ from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.kinds import joins_places
 from factorbus.solver.kernels.model.records import Graph
 
 MOST_ROUNDS = 10  # of a step that has not converged
@@ -20,9 +19,8 @@ LARGE_GAIN = 0.05  # of χ², in one round or all,
 AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
 MOST_LEFT = 0.5  # of the Σ error² that is allowed: what a chord step may leave, as it counts as a round
 SLOW = 0.1  # times as much error² is allowed after a step that had not converged
-UNCHECKED = 0.2  # of `converged_share` χ²: with more Σ error², and as much changed, the decrement is computed;
-CHANGED = 0.5  # of the Σ error² of the last time: less need not have changed, all in all,
-ABSOLUTE = 0.02  # of the same, where factors of one variable have more error² than that
+UNCHECKED = 0.02  # of `converged_share` χ²: where factors whose error is computed have more, the decrement is, too,
+CHANGED = 0.5  # unless less than this share of the Σ error² of the last time has changed, all in all
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -52,27 +50,34 @@ def left(totals: F64) -> float:
 
 @part
 def check_decrement(graph: Graph, tree: Tree, settings: F64) -> None:
-    """Compute the decrement where Σ error² is as small as is allowed, but not by far, has changed by as much, and
-    factors of one variable have a part in it.
+    """Compute the decrement where Σ error² is as small as is allowed, and factors whose error is computed, not bounded,
+    have a part in it that has changed.
     """
     state, totals = tree.state, tree.totals
     error, share = totals[tl.T_ERROR], settings[tl.P_CONVERGED] * (totals[tl.T_CHI2] + LEAST_CHI2)
-    if state[tl.S_CONTINUES] != 0 or error <= UNCHECKED * share or error > allowed(settings, state, totals):
+    least = UNCHECKED * share
+    if (
+        state[tl.S_CONTINUES] != 0
+        or state[tl.S_EXACT] == 0
+        or error <= least
+        or error > allowed(settings, state, totals)
+    ):
         totals[tl.T_EXCESS] = 0.0
-    elif totals[tl.T_UNCHECKED] > max(UNCHECKED * share, CHANGED * totals[tl.T_CHECKED]):
+    elif totals[tl.T_UNCHECKED] > max(least, CHANGED * totals[tl.T_CHECKED]):
         totals[tl.T_UNCHECKED], totals[tl.T_CHECKED], totals[tl.T_EXCESS] = 0.0, error, 0.0
-        if state[tl.S_EXACT] != 0 and error_of_absolute(graph, tree) > ABSOLUTE * share:
-            found = decrement(least_error(settings, state, totals), share, graph, tree)
-            totals[tl.T_EXCESS] = found - error if found > share else 0.0
+        if computed_error(graph, tree) > least:
+            most = slowly_left(settings, state) * (totals[tl.T_CHI2] + LEAST_CHI2)
+            found = decrement(least_error(settings, state, totals), most, graph, tree)
+            totals[tl.T_EXCESS] = found - error if found > most else 0.0
 
 
 @inline_kernel
-def error_of_absolute(graph: Graph, tree: Tree) -> float:
-    """Σ error² of the factors that say where one variable is, alone or with others that are no places: their Jacobians
-    turn alike where a map turns as a whole."""
+def computed_error(graph: Graph, tree: Tree) -> float:
+    """Σ error² of the factors whose error is computed, as (9.11) and (9.31) are: forces of one add up with those of
+    others along what the map hardly holds."""
     total = 0.0
     for f in range(tree.state[tl.S_FACTORS]):
-        if graph.fac[f, at.F_J] < 0 or not joins_places(graph.fac[f, at.F_KIND]):
+        if tree.link[f, tl.L_KIND] >= tl.EXACT or graph.fac[f, at.F_J] < 0:
             total += tree.factor_errors[f, tl.E_ERROR]
     return total
 
@@ -116,13 +121,17 @@ def allowed(settings: F64, state: I64, totals: F64) -> float:
 
 @inline_kernel
 def converged_error(settings: F64, state: I64, totals: F64) -> float:
-    """The Σ error² up to which the step has converged: less after one that had not, since along a valley a Gauss-Newton
-    step takes hardly less off χ² than the one before.  (9.32)
-    """
+    """The Σ error² up to which the step has converged.  (9.32)"""
     chi2 = totals[tl.T_CHI2] + LEAST_CHI2
+    return slowly_left(settings, state) * chi2 * (AFTER_LARGE_GAIN if totals[tl.T_GAINED] > LARGE_GAIN * chi2 else 1.0)
+
+
+@inline_kernel
+def slowly_left(settings: F64, state: I64) -> float:
+    """The share of χ² that the next Gauss-Newton step may take off it after a step that has converged: less after
+    several rounds, or a step that had not, since along a valley each takes off hardly less than the one before."""
     share = settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS] + state[tl.S_CHORDS], 1)
-    share *= SLOW if state[tl.S_SLOW] != 0 else 1.0
-    return share * chi2 * (AFTER_LARGE_GAIN if totals[tl.T_GAINED] > LARGE_GAIN * chi2 else 1.0)
+    return share * (SLOW if state[tl.S_SLOW] != 0 else 1.0)
 
 
 @inline_kernel

@@ -1,8 +1,8 @@
 """What the next Gauss-Newton step would take off χ²: the gradient at the estimate, by R.  MATH (9.39), (9.40)
 
-Σ error² adds up what each factor misses by itself.  Where the Jacobians of many factors have turned alike, their forces
-add up along directions that the map hardly holds, and the step takes off more than that sum.  So where the sum is not
-far below what is allowed, the forces are added up by variable first:
+Σ error² adds up what each factor misses by itself.  Forces of many factors add up along directions that the map hardly
+holds, as where their Jacobians have turned alike, or where only several cameras together say how far away something is,
+and the step takes off more than that sum.  So where the sum is not nothing the forces are added up by variable first:
 
 1  gradient    of the factors with a part in Σ error²: at the estimate, less that of their linear models
 2  forwards    d = R⁻ᵀ g in the cliques of their variables and those above, children first: |d|² is the decrement
