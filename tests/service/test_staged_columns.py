@@ -13,10 +13,11 @@ from naive.solver_parts import graph_in
 from factorbus.proto import codec
 from factorbus.proto.kinds import LOSSES
 from factorbus.proto.limits import REQUEST_LIMITS
-from factorbus.proto.messages import Batch, Insert
+from factorbus.proto.messages import Batch, Factors, Insert, Variables
 from factorbus.service.solving.arrival import try_parse
 from factorbus.solver import Solver, SolverError
 from factorbus.solver.graph.columns import Columns
+from factorbus.solver.kernels.graph import group_table as gt
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -118,3 +119,30 @@ def test_what_the_solver_refuses_leaves_no_trace(seed: int) -> None:
             graph_in(solver).forget(held)
     assert len(codes) > 2
     assert stage_both(quick, usual, last) == ""
+
+
+@pytest.mark.parametrize("behind", [0, 1, -2, 2**40])
+@pytest.mark.parametrize("bad", [0, 1, 2])
+def test_a_lens_that_is_none_is_refused_whatever_stands_behind_the_last_group(bad: int, behind: int) -> None:
+    """Nobody has written there: with 1 in the last row the table had no end, and the kernel that read on the process."""
+    unit, good = np.array([[1.0, 0, 1.0]]), [320, 240, 1, 500, 500, 320, 240, *[0] * 6]
+    lenses = [[*good[:3], 0, *good[4:]] if n == bad else good for n in range(3)]
+    groups = [Factors("point_seen", np.array([[1, 2]]), np.array([lens], float), unit) for lens in lenses]
+    point = Variables("point3", np.array([2]), np.array([[0, 0, 2.0]]))
+    held = Variables("se3", np.array([1]), np.array([[0, 0, 0, 0, 0, 0, 1.0]]), fixed=True)
+    solver = Solver()
+    solver.stage(Batch((held,)))
+    solver.step()
+    before = arenas(solver)
+    message = codec.encode_insert(Insert(1, Batch((point,), tuple(groups))))
+    parsed = try_parse(message, REQUEST_LIMITS)
+    assert parsed is not None
+    table = parsed[3].groups
+    end = int(np.argmax(table[:, gt.G_KIND] == gt.END))
+    table[end, gt.G_FACTORS :] = behind
+    table[end + 1 :] = behind
+    for _ in range(2):
+        with pytest.raises(SolverError) as refused:
+            solver.stage(Columns(message, table))
+        assert refused.value.code == "bad_lens"
+        assert arenas(solver) == before
