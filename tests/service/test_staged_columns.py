@@ -124,7 +124,7 @@ def test_what_the_solver_refuses_leaves_no_trace(seed: int) -> None:
 @pytest.mark.parametrize("behind", [0, 1, -2, 2**40])
 @pytest.mark.parametrize("bad", [0, 1, 2])
 def test_a_lens_that_is_none_is_refused_whatever_stands_behind_the_last_group(bad: int, behind: int) -> None:
-    """Nobody has written there: with 1 in the last row the table had no end, and the kernel that read on the process."""
+    """Nobody has written there.  With 1 in the last row the table had no end, and the kernel read on beyond it."""
     unit, good = np.array([[1.0, 0, 1.0]]), [320, 240, 1, 500, 500, 320, 240, *[0] * 6]
     lenses = [[*good[:3], 0, *good[4:]] if n == bad else good for n in range(3)]
     groups = [Factors("point_seen", np.array([[1, 2]]), np.array([lens], float), unit) for lens in lenses]
