@@ -27,7 +27,8 @@ def test_clients_that_leave_and_are_killed_lose_nothing(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_six_clients_that_do_everything_leave_memory_and_files_as_they_were(tmp_path: Path) -> None:
     result = mixed.run(argparse.Namespace(rounds=3, round_s=1.0, minutes=0.0, clients=6, seed=8), tmp_path)
-    assert (result["faults"], result["same_bits"], result["maps_after_the_kill"]) == ([], True, 6)
+    assert (result["faults"], result["same_bits"]) == ([], True)
+    assert result["maps_after_the_kill"] >= 3, "those that nobody was about to make anew"
     assert len(result["memory_mb"]) == 2
     assert max(result["memory_mb"]) < min(result["memory_mb"]) + 25, "MB, with no map"
     assert set(result["files_on_disk"]) == {1}, "of maps that were dropped there is nothing: the lock alone"

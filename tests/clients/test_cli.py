@@ -63,6 +63,8 @@ def test_version_names_the_libraries() -> None:
     [
         (["frobnicate"], USAGE, "there is no command 'frobnicate'; factorbus --help lists"),
         (["stat"], USAGE, "there is no command 'stat'; did you mean 'stats'?"),
+        (["fork", "yard", "hall"], USAGE, "there is no command 'fork'; did you mean `factorbus change fork`?"),
+        (["covariance", "yard"], USAGE, "did you mean `factorbus ask covariance`?"),
         (["ask", "yard"], USAGE, "The commands of `factorbus ask` are: chi2, components, covariance, "),
         (["plot", "one.g2o"], USAGE, "sparsity, tree. The name of a map or file comes behind one of them"),
         (["replay"], USAGE, "Missing argument 'FILE'"),

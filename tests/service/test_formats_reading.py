@@ -41,12 +41,13 @@ def variables(graph: GraphFile, kind: str, fixed: bool = False, valued: bool = T
     )
 
 
-def test_g2o_in_the_plane(tmp_path: Path) -> None:
-    graph = read_text(
-        tmp_path,
-        "# a comment\r\nVERTEX_SE2 0 1 2 0.5\r\n\r\n   VERTEX_XY 7 3 4\r\nFIX 0\r\n"
-        f"EDGE_SE2 0 3 1 0 0.1 {INFO3}\r\n\tEDGE_SE2_XY 3 7 5 6 1 0.5 2\r\nEDGE_PRIOR_SE2 3 1 1 1 {INFO3}",
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_g2o_in_the_plane(tmp_path: Path, end: str) -> None:
+    text = (
+        "# a comment\nVERTEX_SE2 0 1 2 0.5\n\n   VERTEX_XY 7 3 4\nFIX 0\n"
+        f"EDGE_SE2 0 3 1 0 0.1 {INFO3}\n\tEDGE_SE2_XY 3 7 5 6 1 0.5 2\nEDGE_PRIOR_SE2 3 1 1 1 {INFO3}"
     )
+    graph = read_text(tmp_path, text.replace("\n", end))
     assert graph.dialect == "g2o"
     assert (graph.poses, graph.landmarks) == (2, 1)
     np.testing.assert_array_equal(variables(graph, "se2", fixed=True).values, [[1, 2, 0.5]])

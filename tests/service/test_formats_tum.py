@@ -212,8 +212,17 @@ def test_a_mount_is_no_robot() -> None:
     assert [row.split()[0] for row in rows] == ["0", "1", "2"]
 
 
-def test_a_trajectory_of_kitti_is_called_one(tmp_path: Path) -> None:
-    path = tmp_path / "00.txt"
-    path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
-    with pytest.raises(FormatError, match=r"00\.txt:1: a KITTI pose, which is written and not read; wanted a graph"):
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n"),
+        ("00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0\n"),
+        ("00.kitti", "1 0 0 0 0 1 0 0 0 0 1\n"),
+    ],
+)
+def test_a_trajectory_of_kitti_is_called_one(tmp_path: Path, name: str, text: str) -> None:
+    """Also where a line of it is broken: none is a pose of TUM that lacks numbers."""
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(FormatError, match=rf"{name}:1: a KITTI pose, which is written and not read; wanted a graph"):
         read(path)

@@ -128,3 +128,21 @@ def test_a_worker_is_tried_again_after_a_while_that_doubles(monkeypatch: pytest.
     jobs.submit("bake", b"", ends.append, 1.0, 1e6)
     jobs.joined("a", 1)
     assert jobs.distrusted == [], "it has begun anew"
+
+
+def test_a_job_that_takes_longer_than_was_allowed_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As who asks for the batch optimum is told; a late answer reaches nobody."""
+    now, sent = 1000.0, list[Any]()
+    monkeypatch.setattr(service_jobs.time, "monotonic", lambda: now)
+    jobs = Jobs(Control(), lambda _worker, job, _deadline_s, came: sent.append((job, came)))  # type: ignore[arg-type]
+    jobs.joined("a", 1)
+    ends: list[Ended] = []
+    jobs.submit("batch", graph_job().payload, ends.append, 60.0, 2.5)
+    for passed_s, given_up in ((2.4, False), (0.2, True)):
+        now += passed_s
+        jobs.tick()
+        assert [getattr(end.result, "code", None) for end in ends] == ["unavailable"] * given_up
+    assert "2.5 s" in str(ends[0].result)
+    ((job, came),) = sent
+    came(do_here(Job(job.job, "batch", job.payload)))
+    assert len(ends) == 1

@@ -11,12 +11,13 @@ from naive.random_graphs import camera_steps, random_steps
 from naive.solver_parts import graph_in
 
 from factorbus.proto import codec
-from factorbus.proto.kinds import LOSSES
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.limits import REQUEST_LIMITS
-from factorbus.proto.messages import Batch, Insert
+from factorbus.proto.messages import Batch, Factors, Insert, Variables
 from factorbus.service.solving.arrival import try_parse
 from factorbus.solver import Solver, SolverError
 from factorbus.solver.graph.columns import Columns
+from factorbus.solver.kernels.graph import group_table as gt
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -35,14 +36,16 @@ def arenas(solver: Solver) -> list[bytes]:
     ]  # fmt: skip
 
 
-def stage_both(quick: Solver, usual: Solver, batch: Batch) -> str:
+def stage_both(quick: Solver, usual: Solver, batch: Batch, behind: int | None = None) -> str:
     """Stage in two solvers that are alike, once where it lies in a message; the code of the error, empty: it was taken.
-    They stay alike."""
+    They stay alike.  behind: what stands in the table where nobody has written."""
     message = codec.encode_insert(Insert(1, batch))
     parsed = try_parse(message, REQUEST_LIMITS)
     assert parsed is not None
-    before, came = arenas(quick), []
-    for solver, columns in ((quick, Columns(message, parsed[3].groups)), (usual, batch)):
+    before, came, table = arenas(quick), [], parsed[3].groups
+    if behind is not None:
+        fill_unwritten(table, behind)
+    for solver, columns in ((quick, Columns(message, table)), (usual, batch)):
         try:
             came.append(solver.stage(columns))
         except SolverError as problem:
@@ -53,6 +56,13 @@ def stage_both(quick: Solver, usual: Solver, batch: Batch) -> str:
         assert arenas(quick) == before, "a trace is left"
         return came[0][0]
     return ""
+
+
+def fill_unwritten(table: np.ndarray, number: int) -> None:
+    """Of the last row only the kind is written, and nothing of those behind it."""
+    end = int(np.argmax(table[:, gt.G_KIND] == gt.END))
+    table[end, gt.G_FACTORS :] = number
+    table[end + 1 :] = number
 
 
 @settings(max_examples=25, deadline=None)
@@ -118,3 +128,59 @@ def test_what_the_solver_refuses_leaves_no_trace(seed: int) -> None:
             graph_in(solver).forget(held)
     assert len(codes) > 2
     assert stage_both(quick, usual, last) == ""
+
+
+@pytest.mark.parametrize("behind", [0, 1, -2, 2**40])
+@pytest.mark.parametrize("bad", [0, 1, 2])
+def test_a_lens_that_is_none_is_refused_whatever_stands_behind_the_last_group(bad: int, behind: int) -> None:
+    """Nobody has written there.  With 1 in the last row the table had no end, and the kernel read on beyond it."""
+    unit, good = np.array([[1.0, 0, 1.0]]), [320, 240, 1, 500, 500, 320, 240, *[0] * 6]
+    lenses = [[*good[:3], 0, *good[4:]] if n == bad else good for n in range(3)]
+    groups = [Factors("point_seen", np.array([[1, 2]]), np.array([lens], float), unit) for lens in lenses]
+    point = Variables("point3", np.array([2]), np.array([[0, 0, 2.0]]))
+    held = Variables("se3", np.array([1]), np.array([[0, 0, 0, 0, 0, 0, 1.0]]), fixed=True)
+    solver = Solver()
+    solver.stage(Batch((held,)))
+    solver.step()
+    before = arenas(solver)
+    message = codec.encode_insert(Insert(1, Batch((point,), tuple(groups))))
+    parsed = try_parse(message, REQUEST_LIMITS)
+    assert parsed is not None
+    table = parsed[3].groups
+    fill_unwritten(table, behind)
+    for _ in range(2):
+        with pytest.raises(SolverError) as refused:
+            solver.stage(Columns(message, table))
+        assert refused.value.code == "bad_lens"
+        assert arenas(solver) == before
+
+
+def value_of(kind: str, n: int) -> np.ndarray:
+    """Somewhere that all kinds of factors can be evaluated."""
+    quaternion = [0.0, 0.0, 0.0, 1.0]
+    special = {
+        "se3": [0.2, 0.1, -3.0 * n, *quaternion], "so3": quaternion, "sim3": [1.0 * n, 0.0, 0.0, *quaternion, 1.0],
+        "point3": [0.1, 0.2, 5.0], "idp": [0.0, 0.0, 0.0, 0.1, 0.1, 0.5],
+    }  # fmt: skip
+    return np.array(special.get(kind, [0.3 + n] * VARIABLE_KINDS[kind].size), float)
+
+
+@pytest.mark.parametrize("name", FACTOR_KINDS)
+def test_any_number_of_any_kind_may_be_odd_whatever_stands_behind_the_last_group(name: str) -> None:
+    """A code, the same as from arrays, and no trace; or it is taken by both."""
+    kind = FACTOR_KINDS[name]
+    keys = np.arange(1, len(kind.connects) + 1)
+    held = [Variables(of, keys[n : n + 1], value_of(of, n)[None], True) for n, of in enumerate(kind.connects)]
+    good = Factors(name, keys[None], np.array([kind.example], float), np.eye(kind.dim)[np.triu_indices(kind.dim)][None])
+    codes = set()
+    for column in ("measured", "information"):
+        for place in range(getattr(good, column).shape[1]):
+            quick, usual = Solver(), Solver()
+            for solver in (quick, usual):
+                solver.stage(Batch(tuple(held)))
+            for odd in (0.0, -1.0, np.nan, np.inf, 5e-324, 1e300, 7.0):
+                numbers = getattr(good, column).copy()
+                numbers[0, place] = odd
+                codes.add(stage_both(quick, usual, Batch((), (good._replace(**{column: numbers}),)), behind=1))
+    assert "not_finite" in codes
+    assert len(codes) > 1

@@ -12,6 +12,7 @@ from journalled import Services, check_journal, rows
 from processes import PATIENCE_S
 
 from factorbus.cli.commands.journal import verify
+from factorbus.cli.driving.columns import merged
 from factorbus.client import Changes, Draft, connect
 from factorbus.client.map import Map
 from factorbus.proto.messages import Batch
@@ -70,6 +71,37 @@ def test_a_bystander_waits_for_no_more_than_the_change_under_way(
         assert stats["inserts"]["accepted"] == 20 + BURST + 10
         assert stats["inserts"]["busy"] > 0, "of the burst no more than `limits.changes` wait at a time"
         assert stats["journal"]["checkpoint_record"] == 0, "no change has a checkpoint of its own"
+
+
+@pytest.mark.timeout(900)
+def test_on_twenty_thousand_poses_150_losses_of_one_factor_keep_nobody_waiting(
+    services: Callable[..., Services], tmp_path: Path
+) -> None:
+    """Another client's tiny insert took up to 18.7 s, behind passes over all of the map; now one change comes first."""
+    steps = list(manhattan(20_000, 1))
+    drive, true = (merged(each) for each in ([s.batch for s in steps], [Batch(tuple(s.truth)) for s in steps]))
+    endpoint = services(tmp_path / "journal").start()
+    with (
+        connect(endpoint, client="changer", timeout_s=PATIENCE_S) as one,
+        connect(endpoint, client="bystander", timeout_s=PATIENCE_S) as two,
+        one.map("large", window=BURST, mirror=False) as changer,
+        two.map("large", mirror=False) as bystander,
+    ):
+        changer.insert(Batch(true.variables, drive.factors), settle=True)
+        (edges,) = drive.factors
+        loop = int(np.flatnonzero(np.abs(edges.keys[:, 1] - edges.keys[:, 0]) > 1)[7])
+        changes = [Changes().loss([loop], "huber", 1.0 + n % 3) for n in range(BURST)]
+        pending_inserts = [changer.send(Batch(), changes=each) for each in changes]
+        pending_inserts[0].result(PATIENCE_S)
+        passed = []
+        for n in range(5):
+            before = bystander.stats()["revision"]
+            passed.append(bystander.insert(tiny(n)).revision - before - 1)
+        assert not pending_inserts[-1].done(), "else nothing was waited for"
+        assert np.median(passed) <= 2, f"{passed} changes were made between an insert and its answer"
+        reports = [pending_insert.result(PATIENCE_S).report for pending_insert in pending_inserts]
+        assert {each["strategy"] for each in reports} <= {"tree", "extend"}, "none is a pass over the whole map"
+        assert np.median([each["eliminated"] for each in reports]) < 2000
 
 
 @pytest.mark.timeout(900)

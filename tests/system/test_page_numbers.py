@@ -287,3 +287,64 @@ def test_a_refusal_in_one_insert_of_a_kind_or_loss_that_came_later_changes_nothi
         assert (came.code, came.detail["next"]) == (code, 2)
     assert client.estimate(name) == before
     assert "revision" in insert(client, name, factors=[between("x0", "x1") | {"later": [1, {"a": b"b"}]}], later=7)
+
+
+def one(kind: str, keys: bytes, measured: bytes, dim: int) -> dict[str, Any]:
+    """A factor of unit information."""
+    return {"kind": kind, "keys": keys, "measured": measured, "information": floats(*np.eye(dim)[np.triu_indices(dim)])}
+
+
+LENS = [1, 500, 500, 320, 240, *[0] * 6]
+CONTENT = {
+    "bad_range": one("range_se2", ints("x0", "p0"), floats(-1), 1),
+    "bad_direction": one("bearing_se3", ints("y0", "q0"), floats(0, 0, 0), 3),
+    "bad_lens": one("point_seen", ints("y0", "q0"), floats(320, 240, 1, 0, *LENS[2:]), 2),
+    "bad_observation": one("point_seen", ints("y0", "q1"), floats(320, 240, *LENS), 2),
+}
+
+
+@pytest.mark.parametrize("code", CONTENT)
+def test_what_is_wrong_with_a_measurement_has_its_code_and_says_where(client: Bare, code: str) -> None:
+    name = f"content-{code.replace('_', '-')}"
+    ask(client, "admin/create", map=name)
+    held = [
+        {"kind": "se2", "keys": ints("x0"), "values": floats(0, 0, 0), "fixed": True},
+        {"kind": "se3", "keys": ints("y0"), "values": floats(0, 0, 0, 0, 0, 0, 1), "fixed": True},
+        {"kind": "point2", "keys": ints("p0"), "values": floats(1, 0), "fixed": True},
+        {"kind": "point3", "keys": ints("q0", "q1"), "values": floats(0, 0, 2, 0, 0, -2), "fixed": True},
+    ]
+    assert "revision" in insert(client, name, variables=held)
+    before = client.estimate(name)
+    came = insert(client, name, factors=[CONTENT[code]])
+    refused(came, code, next=2)
+    assert isinstance(came.detail["where"], str)
+    assert client.estimate(name) == before
+
+
+def test_a_question_for_features_names_a_camera_that_cannot_be(client: Bare) -> None:
+    service = ask(client, "admin/maps")["service"]
+    state, covariance = floats(0, 0, 0, 1, *[0] * 9), floats(*np.eye(13).ravel())
+    rest = {"pixels": floats(300, 200), "rho": 0.5, "sigma_rho": 0.2, "sigma_pixel": 1.0}
+    asked = {"state": state, "covariance": covariance, **rest}
+    for model, numbers in (("pinhole", floats(0, 500, 320, 240)), ("pinhole", floats(500)), ("periscope", b"")):
+        camera = {"model": model, "numbers": numbers}
+        came = ask(client, f"features/{service}/ask", camera=camera, **asked)
+        assert isinstance(came, Refused)
+        assert came.code in ("bad_camera", "bad_message"), came
+    refused(ask(client, f"features/{service}/ask", camera=camera, **asked), "bad_camera")
+
+
+def test_what_shares_factors_with_too_much_is_not_marginalized(client: Bare) -> None:
+    ask(client, "admin/create", map="hub")
+    points = ints(*(f"p{n}" for n in range(129)))
+    hub = {"kind": "se2", "keys": ints("x0"), "values": floats(0, 0, 0)}
+    seen = ints(*(each for n in range(129) for each in ("x0", f"p{n}")))
+    factors = [
+        one("prior_se2", ints("x0"), floats(0, 0, 0), 3),
+        {"kind": "landmark_se2", "keys": seen, "measured": floats(*[1, 1] * 129),
+         "information": floats(*[1, 0, 1] * 129)},
+    ]  # fmt: skip
+    assert "revision" in insert(client, "hub", variables=[hub, {"kind": "point2", "keys": points}], factors=factors)
+    came = insert(client, "hub", changes=[{"change": "marginalize", "keys": ints("x0")}])
+    refused(came, "too_connected", next=2)
+    assert sorted(came.detail["separator"]) == sorted(np.frombuffer(points, "<i8").tolist())

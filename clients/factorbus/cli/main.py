@@ -51,6 +51,7 @@ COMMANDS = {
     "robot": ("robot", ""),
 }
 _HIDDEN = ("robot",)
+_GROUPS = ("ask", "change", "plot", "journal", "datasets")  # commands that have commands
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 _EPILOG = """\b
@@ -79,9 +80,15 @@ class _Commands(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
-            meant = nearest(args[0], self.list_commands(ctx))
+            within = " or ".join(f"`factorbus {group} {args[0]}`" for group in self._groups_with(ctx, args[0]))
+            meant = f"; did you mean {within}?" if within else nearest(args[0], self.list_commands(ctx))
             ctx.fail(f"there is no command {args[0]!r}{meant or '; factorbus --help lists those there are'}")
         return super().resolve_command(ctx, args)
+
+    def _groups_with(self, ctx: click.Context, name: str) -> list[str]:
+        """Those commands that have one of this name among theirs, as `change` has `fork`."""
+        groups = {group: self.get_command(ctx, group) for group in _GROUPS}
+        return [group for group, found in groups.items() if isinstance(found, click.Group) and name in found.commands]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

@@ -48,6 +48,8 @@ def buckets_of(file: str, content: bytes) -> dict[str, Bucket]:
                 raise FormatError(file, None, seen, f"a text file in ASCII or UTF-8, plain or gzipped: {mend}")
         line = content.count(b"\n", 0, content.index(b"\0")) + 1
         raise FormatError(file, line, "a zero byte", "a text file in ASCII or UTF-8")
+    if b"\n" not in content:
+        content = content.replace(b"\r", b"\n")  # all that ends a line there, as on the Macs of old
     found: dict[bytes, Bucket] = {}
     number, end = 1, -2
     for match in _LINE.finditer(content):

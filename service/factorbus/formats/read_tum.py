@@ -36,7 +36,8 @@ def read_trajectory(file: str, buckets: Mapping[str, Bucket]) -> GraphFile:
         for time, bucket in buckets.items()
         for line, rest in zip(bucket.numbers, bucket.rests, strict=True)
     )
-    if all(len(rest.split()) == _KITTI - 1 for _, _, rest in rows):
+    first = len(rows[0][2].split())
+    if first == _KITTI - 1 or (file.endswith(".kitti") and first != 7):
         raise FormatError(file, rows[0][0], "a KITTI pose, which is written and not read", "a graph, or TUM's poses")
     poses = Bucket([rest for _, _, rest in rows], [line for line, _, _ in rows])
     stamps = np.array([nanoseconds(file, line, time) for line, time, _ in rows], np.int64)

@@ -80,11 +80,11 @@ def locate_columns(batch: BatchLike) -> tuple[bytes, I64, errors.SolverError | N
 def limit_lenses(raw: bytes, groups: I64) -> tuple[bytes, I64, errors.SolverError | None]:
     """The same columns, where lenses have their limits; or those before the first group of factors with a lens that is
     none, and what is wrong with it."""
-    groups, added, end = groups.copy(), list[bytes](), len(raw)
-    for g in range(len(groups)):
+    # Of the last row, and of those behind it, nothing but the kind of the last is written.
+    last = int(np.argmax(groups[:, gt.G_KIND] == gt.END))
+    groups, added, end = groups[: last + 1].copy(), list[bytes](), len(raw)
+    for g in range(last):
         row = groups[g]
-        if row[gt.G_KIND] == gt.END:
-            break
         kind = FACTOR_KIND_OF_CODE.get(int(row[gt.G_KIND])) if row[gt.G_FACTORS] else None
         if kind is None or kind.name not in LENS_AT:
             continue
@@ -96,6 +96,7 @@ def limit_lenses(raw: bytes, groups: I64) -> tuple[bytes, I64, errors.SolverErro
             limited = with_limits(kind, measured)
         except errors.SolverError as problem:
             stays = (groups[:, gt.G_FACTORS] == 0) | (np.arange(len(groups)) < g)
+            stays[last] = True
             return b"".join([raw, *added]), groups[stays], problem
         added.append(limited.tobytes())
         row[gt.G_NUMBERS], end = end, end + len(added[-1])
