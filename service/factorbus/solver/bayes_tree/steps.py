@@ -36,7 +36,7 @@ from factorbus.solver.sparse.elimination import Elimination
 
 _START: Mark = (0,) * at.COUNTS
 _ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
-_COUNTS = tl.S_CYCLES - tl.S_REPORT_BEGIN
+_COUNTS, _PHASES = slice(tl.S_REPORT_BEGIN, tl.S_CYCLES), slice(tl.S_CYCLES, tl.S_REPORT_END)
 # What back-substitution left undone, below which there is no need to go on, as a share of χ²: by the bound (9.17), some
 # hundred times what it comes to.
 _FINISHED_LEFT = 1e-7
@@ -338,12 +338,10 @@ class TreeSteps:
         before, self._mark = self._mark, self._graph.mark()
         now, clock, tree = self._mark, self._options.clock, self._tree
         self._first_new, self._batched = before[at.VARIABLES], result is not None
-        reported = tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
-        nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
+        nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = tree.state[_COUNTS].tolist()
         compiled_ms = 1e3 * (compiled - started)
-        _, chi2, _, error, allowed, chi2_before = tree.totals[: tl.T_BEFORE + 1].tolist()
-        chi2 = max(chi2, 0.0)  # a running sum: 0 may come out as less, by rounding
-        converged = clear or (result.converged if result else self._has_converged(chi2, error, allowed))
+        chi2 = max(tree.totals.item(tl.T_CHI2), 0.0)  # a running sum: 0 may come out as less, by rounding
+        converged = clear or (result.converged if result else self._has_converged(chi2))
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
@@ -352,7 +350,7 @@ class TreeSteps:
             because or why_tree(relinearized, rounds, tree.state.item(tl.S_CHORDS)),
             result.iterations if result else rounds,
             chi2,
-            max(chi2_before, 0.0),
+            max(tree.totals.item(tl.T_BEFORE), 0.0),
             now[at.VARIABLES] - before[at.VARIABLES],
             now[at.FACTORS] - now[at.MEMBERS] - before[at.FACTORS] + before[at.MEMBERS],
             self._moved.size if result else changed,
@@ -363,16 +361,16 @@ class TreeSteps:
             float(flops),
             self._damping,
             converged,
-            PhaseShares(tl.PHASES, reported[_COUNTS:], compiled_ms) if clock else _NO_SHARES,
+            PhaseShares(tl.PHASES, tree.state[_PHASES].tolist(), compiled_ms) if clock else _NO_SHARES,
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
         ) + (self._left(result, budget) if budget else _NO_BUDGET))  # fmt: skip
 
-    def _has_converged(self, chi2: float, error: float, allowed: float) -> bool:
+    def _has_converged(self, chi2: float) -> bool:
         """Whether the tree's own step has, by what it left."""
-        tree, share = self._tree, self._options.converged_share
+        tree, totals, share = self._tree, self._tree.totals, self._options.converged_share
         if (
-            error + tree.totals.item(tl.T_EXCESS) <= allowed
+            totals.item(tl.T_ERROR) + totals.item(tl.T_EXCESS) <= totals.item(tl.T_ALLOWED)
             and not tree.behind
             and unsolved(tree) <= share * (chi2 + LEAST_CHI2)
             and (not tree.raised or self._is_within(share, chi2))
