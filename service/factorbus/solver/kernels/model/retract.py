@@ -92,9 +92,23 @@ def common_label(picked: I64, graph_table: I64) -> int:
     return label
 
 
+@inline_kernel
+def run_from(n: int, picked: I64) -> int:
+    """How many of the picked variables from the n-th on follow each other; in steps that double, then halve."""
+    run, more = 1, 1
+    while n + run + more <= picked.size and picked[n + run + more - 1] == picked[n] + run + more - 1:
+        run += more
+        more *= 2
+    while more > 0:
+        if n + run + more <= picked.size and picked[n + run + more - 1] == picked[n] + run + more - 1:
+            run += more
+        more //= 2
+    return run
+
+
 @kernel("void(int64[::1], int64[::1], int64[::1], float64[:,::1])")
 def gather_values(picked: I64, graph_table: I64, out_keys: I64, out_values: F64) -> None:
-    """Keys and values of the picked variables, which are of one kind: those that follow each other, together.
+    """Keys and values of the picked variables, ascending and of one kind: those that follow each other, together.
 
     graph_table: of its arrays (`records`).  Without room in out_keys only the values.
     """
@@ -103,9 +117,7 @@ def gather_values(picked: I64, graph_table: I64, out_keys: I64, out_values: F64)
     size, out = out_values.shape[1], out_values.reshape(-1)
     n = 0
     while n < picked.size:
-        v, run = picked[n], 1
-        while n + run < picked.size and picked[n + run] == v + run:
-            run += 1
+        v, run = picked[n], run_from(n, picked)
         x = var[v, at.V_AT]
         for k in range(run if out_keys.size > 0 else 0):
             out_keys[n + k] = keys[v + k]
