@@ -89,7 +89,7 @@ def eliminate_again(
     tops = commit_renewed(renewed, old, clique, numbers, state, totals)
     add_constants(state[tl.S_TAKEN], new.f1, graph.var, graph.fac, link, tree.hessian, totals)
     if state[tl.S_EDITED] != 0:
-        rescale(new.f1, settings, totals)
+        rescale(new.f1, graph.counts[at.SCALARS], tree.settings, state, totals, settings)
     if moving.size > 0:
         note_relinearized(moving, state[tl.S_FLOPS] - flops, node, tree.pending, state)
     note_work(work_of_cliques(ids, clique) + work_of_cliques(renewed, clique), totals)

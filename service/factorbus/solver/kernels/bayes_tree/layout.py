@@ -220,4 +220,6 @@ T_ERROR_BEFORE = 17  # T_ERROR before the step
 T_UNCHECKED = 18  # by how much error² of factors has changed, all in all, since the decrement was computed,
 T_CHECKED = 19  # and T_ERROR as it was then
 T_EXCESS = 20  # by how much the decrement was more than that, (9.40), where it was too much
-T_SIZE = 21
+T_COST_RATIO = 21  # r of (9.19), as it was when the step began,
+T_COOLDOWN = 22  # and (9.19)
+T_SIZE = 23

@@ -44,7 +44,7 @@ from factorbus.solver.kernels.bayes_tree.defer import (
 from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, follow_up, lap
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearize
-from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2, residual_unit, scale_thresholds
+from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2, note_cooldown, residual_unit, scale_thresholds
 from factorbus.solver.kernels.bayes_tree.touch import NewRows
 from factorbus.solver.kernels.bayes_tree.worker_thread import run_tasks
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
@@ -79,6 +79,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         if status != tl.DONE:
             return status
         note_before(v1, f1, settings[tl.P_BUDGET] < math.inf, state, totals)
+        note_cooldown(settings, state, totals)
     scaled = scale_thresholds(f1, graph.counts[at.SCALARS], settings, state, totals)
     bounded = scaled[tl.P_BUDGET] < math.inf
     if state[tl.S_CONTINUES] != 0 and not goes_on_with_it:

@@ -17,12 +17,19 @@ def scale_thresholds(factors: int, scalars: int, tree_settings: F64, state: I64,
     scaled[tl.P_WILDFIRE_THRESHOLD] = 0.0 if whole else scaled[tl.P_WILDFIRE_THRESHOLD] * per_scalar
     scaled[tl.P_RELINEARIZE_THRESHOLD] *= unit
     scaled[tl.P_MAX_ERROR] *= unit
-    scaled[tl.P_COOLDOWN_FLOPS] = max(state[tl.S_RELINEARIZING] / tree_settings[tl.P_COOLDOWN_FLOPS], 1.0)
-    share = unit * unit * max(factors, 1) * cooldown_share(scaled, state)  # of χ²
+    share = unit * unit * max(factors, 1) * totals[tl.T_COOLDOWN]  # of χ²
     scaled[tl.P_SAME_STEP_SHARE] *= share
     scaled[tl.P_NEXT_STEP_SHARE] *= share
-    scaled[tl.P_MAX_WAIT] *= scaled[tl.P_COOLDOWN_FLOPS]
+    scaled[tl.P_MAX_WAIT] *= totals[tl.T_COST_RATIO]
     return scaled
+
+
+@inline_kernel
+def note_cooldown(tree_settings: F64, state: I64, totals: F64) -> None:
+    """What (9.19) asks for in a step that begins.  It is kept, as a step that found no room goes on with the same: by
+    then a round of it may have relinearized, and whether there is room must not matter."""
+    cost_ratio = max(state[tl.S_RELINEARIZING] / tree_settings[tl.P_COOLDOWN_FLOPS], 1.0)
+    totals[tl.T_COST_RATIO], totals[tl.T_COOLDOWN] = cost_ratio, cooldown_share(cost_ratio, tree_settings, state)
 
 
 @inline_kernel
@@ -32,20 +39,16 @@ def residual_unit(factors: int, totals: F64) -> float:
 
 
 @part
-def rescale(factors: int, settings: F64, totals: F64) -> None:
+def rescale(factors: int, scalars: int, tree_settings: F64, state: I64, totals: F64, settings: F64) -> None:
     """The thresholds in what a residual is like without the factors that were taken out, or with their new weights."""
-    unit = residual_unit(factors, totals)
-    times = unit / totals[tl.T_UNIT]
-    totals[tl.T_UNIT] = unit
-    for each in (tl.P_WILDFIRE_THRESHOLD, tl.P_RELINEARIZE_THRESHOLD, tl.P_MAX_ERROR):
-        settings[each] *= times
-    for each in (tl.P_SAME_STEP_SHARE, tl.P_NEXT_STEP_SHARE):
-        settings[each] *= times * times
+    totals[tl.T_UNIT] = residual_unit(factors, totals)
+    scaled = scale_thresholds(factors, scalars, tree_settings, state, totals)
+    for each in range(settings.size):
+        settings[each] = scaled[each]
 
 
 @inline_kernel
-def cooldown_share(settings: F64, state: I64) -> float:
+def cooldown_share(cost_ratio: float, settings: F64, state: I64) -> float:
     """The factor on both shares so soon after the last relinearization.  (9.19)"""
-    cost_ratio = settings[tl.P_COOLDOWN_FLOPS]
     rested = settings[tl.P_COOLDOWN_STEPS] * cost_ratio / max(state[tl.S_STEP] - state[tl.S_RELINEARIZED_AT], 1)
     return min(max(rested * rested, 1.0), settings[tl.P_COOLDOWN_FACTOR] * math.sqrt(cost_ratio))
