@@ -371,7 +371,7 @@ class TreeSteps:
         tree, totals, share = self._tree, self._tree.totals, self._options.converged_share
         if (
             totals.item(tl.T_ERROR) + totals.item(tl.T_EXCESS) <= totals.item(tl.T_ALLOWED)
-            and not tree.behind
+            and not (tree.behind or tree.slow)
             and unsolved(tree) <= share * (chi2 + LEAST_CHI2)
             and (not tree.raised or self._is_within(share, chi2))
         ):

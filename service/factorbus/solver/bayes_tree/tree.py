@@ -114,6 +114,11 @@ class CliqueTree(Arenas):
         return self.state.item(tl.S_BEHIND) != 0
 
     @property
+    def slow(self) -> bool:
+        """Whether the last step left more than is called converged, by what the tree knows, and not for a budget."""
+        return self.state.item(tl.S_SLOW) != 0
+
+    @property
     def failed(self) -> int:
         """The variable whose pivot made the last step fail."""
         return int(self.state[tl.S_FAILED])

@@ -130,7 +130,12 @@ def converged_error(settings: F64, state: I64, totals: F64) -> float:
 def slowly_left(settings: F64, state: I64) -> float:
     """The share of χ² that the next Gauss-Newton step may take off it after a step that has converged: less after
     several rounds, or a step that had not, since along a valley each takes off hardly less than the one before."""
-    share = settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS] + state[tl.S_CHORDS], 1)
+    return once_slow(settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS] + state[tl.S_CHORDS], 1), state)
+
+
+@inline_kernel
+def once_slow(share: float, state: I64) -> float:
+    """A share, or less of it where the step before had not converged."""
     return share * (SLOW if state[tl.S_SLOW] != 0 else 1.0)
 
 
@@ -148,6 +153,13 @@ def is_clear(state: I64, totals: F64) -> bool:
 
 
 @inline_kernel
+def never_solved(totals: F64) -> float:
+    """What of the linear problem is not solved where the estimate was put back to the linearization points, from where
+    cliques are solved again only below what moves."""
+    return max(totals[tl.T_CHI2] - totals[tl.T_MODEL], 0.0) if totals[tl.T_LEFT] == math.inf else 0.0
+
+
+@inline_kernel
 def note_after(settings: F64, state: I64, totals: F64) -> None:
     """What is to be done after the step, and what the optimum is at least."""
     chi2 = totals[tl.T_CHI2]
@@ -155,7 +167,8 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
     # What a budget has put off says nothing of how fast the others converge.
     put_off = state[tl.S_PENDING] != 0 and settings[tl.P_BUDGET] < math.inf
     unconverged = left(totals) > totals[tl.T_ALLOWED]
-    state[tl.S_SLOW] = 1 if unconverged and not put_off else 0
+    unsolved = never_solved(totals) > once_slow(settings[tl.P_CONVERGED], state) * (chi2 + LEAST_CHI2)
+    state[tl.S_SLOW] = 1 if (unconverged or unsolved) and not put_off else 0
     if unconverged and put_off:
         state[tl.S_DUE] = 1
     state[tl.S_AFTER] = 0
