@@ -4,7 +4,7 @@ from typing import Annotated, NamedTuple
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.jit.compile import I64
-from factorbus.solver.kernels.jit.records import Columns, FloatRows, Floats, IntRows, Ints, opener
+from factorbus.solver.kernels.jit.records import FloatRows, Floats, IntRows, Ints, RowWidth, opener
 
 
 class Tree(NamedTuple):
@@ -37,16 +37,16 @@ class Tree(NamedTuple):
     """
 
     settings: Floats
-    node: Annotated[IntRows, Columns(tl.N_WIDTH)]
-    link: Annotated[IntRows, Columns(tl.L_WIDTH)]
-    clique: Annotated[IntRows, Columns(tl.C_WIDTH)]
+    node: Annotated[IntRows, RowWidth(tl.N_WIDTH)]
+    link: Annotated[IntRows, RowWidth(tl.L_WIDTH)]
+    clique: Annotated[IntRows, RowWidth(tl.C_WIDTH)]
     lists: Ints
     numbers: Floats
     hessian: Floats
     lin: FloatRows
     scalars: FloatRows
-    factor_errors: Annotated[FloatRows, Columns(tl.E_WIDTH)]
-    turns: Annotated[FloatRows, Columns(tl.U_WIDTH)]
+    factor_errors: Annotated[FloatRows, RowWidth(tl.E_WIDTH)]
+    turns: Annotated[FloatRows, RowWidth(tl.U_WIDTH)]
     pending: Ints
     changed: Ints
     moved: Ints

@@ -6,7 +6,7 @@ that makes one of a table of addresses (`array_table`), whose rows are in the or
     class Lists(NamedTuple):
         starts: Ints
         values: FloatRows
-        places: Annotated[IntRows, Columns(4)]
+        places: Annotated[IntRows, RowWidth(4)]
 
     lists_at = opener(Lists)
 
@@ -36,7 +36,7 @@ FloatRows = Annotated[F64, (np.float64, 2)]
 Record = TypeVar("Record", bound=tuple[Any, ...])
 
 
-class Columns(NamedTuple):
+class RowWidth(NamedTuple):
     """How many columns an array of rows always has: kernels then compute with the number instead of reading it."""
 
     count: int

@@ -2,7 +2,7 @@
 
 from typing import Annotated, NamedTuple
 
-from factorbus.solver.kernels.jit.records import Columns, Floats, IntRows, Ints, opener
+from factorbus.solver.kernels.jit.records import Floats, IntRows, Ints, RowWidth, opener
 from factorbus.solver.kernels.model import layout as at
 
 
@@ -21,8 +21,8 @@ class Graph(NamedTuple):
     stamps   (n,)   int64    the variables' time stamps, which the solver carries and never looks into; NO_STAMP: none
     """
 
-    var: Annotated[IntRows, Columns(at.V_WIDTH)]
-    fac: Annotated[IntRows, Columns(at.F_WIDTH)]
+    var: Annotated[IntRows, RowWidth(at.V_WIDTH)]
+    fac: Annotated[IntRows, RowWidth(at.F_WIDTH)]
     values: Floats
     payload: Floats
     counts: Ints
