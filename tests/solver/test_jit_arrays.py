@@ -4,15 +4,9 @@ import sys
 
 import numpy as np
 import pytest
-from naive.solver_parts import graph_in, tree_of
 from numba.core.runtime import _nrt_python, rtsys
 
-from factorbus.simulate import WORLDS
-from factorbus.solver import Solver
-from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit import compile as _jit
-from factorbus.solver.kernels.jit.records import fields_of
-from factorbus.solver.kernels.model.records import Graph
 
 
 @_jit.part
@@ -139,18 +133,3 @@ def test_an_array_that_is_assigned_to_a_part_of_another_is_refused(kernel):
         NotImplementedError, match="assigned to a part of another array; a kernel copies number by number"
     ):
         kernel(np.zeros((2, 3)), np.ones(3))
-
-
-def test_arrays_have_the_columns_that_kernels_compute_with() -> None:
-    """What a record says of its arrays is built into the kernels: an array of another width would be read wrongly."""
-    solver = Solver()
-    for step in WORLDS["city_trees"](30, 1):
-        solver.stage(step.batch)
-        solver.step()
-    told = 0
-    for record, holder in ((Graph, graph_in(solver)), (Tree, tree_of(solver))):
-        for name, field in fields_of(record).items():
-            if field.columns:
-                assert getattr(holder, name).shape[1] == field.columns, name
-                told += 1
-    assert told >= 7
