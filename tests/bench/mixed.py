@@ -12,7 +12,6 @@ does not grow: the most of the last third is at most 1.05 times the most of the 
 """
 
 import argparse
-import json
 import logging
 import random
 import signal
@@ -30,6 +29,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from bench.results import print_figures
 from process_memory import resident
 from processes import Process, processes
 
@@ -229,7 +229,8 @@ def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     began, has, number = time.monotonic(), list[dict[str, int]](), 0
     with ExitStack() as stack:
         service = Service(stack.enter_context(processes(folder)), folder)
-        rounds = options.rounds or max(round(60 * options.minutes / options.round_s), 1)
+        # One at least that ends with its maps dropped, and the last, whose maps have to be there after the kill.
+        rounds = max(options.rounds or round(60 * options.minutes / options.round_s), 2)
         for number in range(rounds):
             _round(service.endpoint, options, options.seed + 1000 * number, (done, codes, faults))
             last = number == rounds - 1
@@ -288,18 +289,14 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=20.0)
     parser.add_argument("--clients", type=int, default=6)
     parser.add_argument("--round-s", type=float, default=20.0)
-    parser.add_argument("--rounds", type=int, default=0, help="in place of --minutes")
+    parser.add_argument("--rounds", type=int, default=0, help="in place of --minutes; two at least")
     parser.add_argument("--seed", type=int, default=random.randrange(2**31))
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     logging.getLogger("factorbus").setLevel(logging.ERROR)  # exports say what they leave out
     with tempfile.TemporaryDirectory() as folder:
         result = run(options, Path(folder))
-    if options.json:
-        print(json.dumps(result, indent=2))
-    else:
-        for name, value in result.items():
-            print(f"{name:24} {value}")
+    print_figures(result, options.json)
     return 0 if held(result) else 1
 
 

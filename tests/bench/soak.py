@@ -15,7 +15,6 @@ Goal: nothing lost, nothing duplicated, and the memory grows by less than 32 byt
 """
 
 import argparse
-import json
 import os
 import random
 import sys
@@ -31,6 +30,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from bench.results import print_figures
 from process_memory import resident
 from processes import Process, processes
 
@@ -291,11 +291,7 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         result = run(options, Path(folder))
-    if options.json:
-        print(json.dumps(result, indent=2))
-    else:
-        for name, value in result.items():
-            print(f"{name:24} {value}")
+    print_figures(result, options.json)
     flat = not result["memory_bytes_per_insert"] > GOAL_BYTES
     return 0 if not result["lost"] and not result["duplicated"] and flat else 1
 

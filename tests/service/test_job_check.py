@@ -131,7 +131,7 @@ def test_a_worker_is_tried_again_after_a_while_that_doubles(monkeypatch: pytest.
 
 
 def test_a_job_that_takes_longer_than_was_allowed_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As who asks for the batch optimum is told; a late answer reaches nobody."""
+    """The same goes to a client that asks for the batch optimum; a late answer reaches nobody."""
     now, sent = 1000.0, list[Any]()
     monkeypatch.setattr(service_jobs.time, "monotonic", lambda: now)
     jobs = Jobs(Control(), lambda _worker, job, _deadline_s, came: sent.append((job, came)))  # type: ignore[arg-type]

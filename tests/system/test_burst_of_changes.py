@@ -42,6 +42,15 @@ def tiny(number: int) -> Draft:
     return Draft().se2(f"t{number}").between_se2("x0", f"t{number}", (0.1, 0, 0), sigmas=SIGMAS)
 
 
+def passed_by(bystander: Map, inserts: int) -> list[int]:
+    """For each of these inserts how many other steps the map took before it."""
+    passed = []
+    for n in range(inserts):
+        before = bystander.stats()["revision"]
+        passed.append(bystander.insert(tiny(n)).revision - before - 1)
+    return passed
+
+
 @pytest.mark.timeout(900)
 def test_a_bystander_waits_for_no_more_than_the_change_under_way(
     services: Callable[..., Services], tmp_path: Path
@@ -58,10 +67,7 @@ def test_a_bystander_waits_for_no_more_than_the_change_under_way(
         changes = [Changes().fix("x900") if n % 2 == 0 else Changes().free("x900") for n in range(BURST)]
         pending_inserts = [changer.send(Batch(), changes=each) for each in changes]
         pending_inserts[0].result(PATIENCE_S)
-        passed = []
-        for n in range(10):
-            before = bystander.stats()["revision"]
-            passed.append(bystander.insert(tiny(n)).revision - before - 1)
+        passed = passed_by(bystander, 10)
         assert not pending_inserts[-1].done(), "else nothing was waited for"
         # The one under way; and those between the answer to the question and the arrival of the insert.
         assert np.median(passed) <= 2, f"{passed} changes were made between an insert and its answer"
@@ -93,10 +99,7 @@ def test_on_twenty_thousand_poses_150_losses_of_one_factor_keep_nobody_waiting(
         changes = [Changes().loss([loop], "huber", 1.0 + n % 3) for n in range(BURST)]
         pending_inserts = [changer.send(Batch(), changes=each) for each in changes]
         pending_inserts[0].result(PATIENCE_S)
-        passed = []
-        for n in range(5):
-            before = bystander.stats()["revision"]
-            passed.append(bystander.insert(tiny(n)).revision - before - 1)
+        passed = passed_by(bystander, 5)
         assert not pending_inserts[-1].done(), "else nothing was waited for"
         assert np.median(passed) <= 2, f"{passed} changes were made between an insert and its answer"
         reports = [pending_insert.result(PATIENCE_S).report for pending_insert in pending_inserts]
