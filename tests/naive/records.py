@@ -16,8 +16,8 @@ def graph_of(arrays: dict[str, np.ndarray]) -> Graph:
 
 
 def tree_of(arrays: dict[str, np.ndarray]) -> Tree:
-    """The tree with these of its arrays; the others are empty."""
-    return _record_of(Tree, tree_at, arrays)
+    """The tree with these of its arrays; the others are empty, and there is no room in `scratch`."""
+    return _record_of(Tree, tree_at, {"scratch": np.ones(1, np.int64)} | arrays)
 
 
 def _record_of(record: type, record_at: Any, arrays: dict[str, np.ndarray]) -> Any:

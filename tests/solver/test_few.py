@@ -14,6 +14,7 @@ from factorbus.solver.kernels.bayes_tree.order import NEWEST, find_lowest, list_
 from factorbus.solver.kernels.bayes_tree.order_small import PLANES, analyze_few, join_few, order_few
 from factorbus.solver.kernels.jit.bit_sets import MOST, count_bits, highest_bit, lowest_bit
 from factorbus.solver.kernels.jit.compile import I64, part
+from factorbus.solver.kernels.jit.scratch import WORDS
 from factorbus.solver.kernels.model import layout as at
 
 STAMP, STEP, RECENT, FIRST = 7, 20, 5, 3  # variables of the map before the first that is affected
@@ -107,7 +108,7 @@ def ordered(few: Affected, last: int = -1) -> tuple[I64, I64, I64, I64, dict[str
     a = few.arrays()
     n = len(few.kinds)
     near, hung = join_few(graph_of(a), tree_of(a), n, a["factors"], a["orphans"])
-    perm, row, planes = order_few(n, near, a["affected"], RECENT, last, a["var"], a["node"], a["state"])
+    perm, row, planes = order_few(near, a["affected"], RECENT, last, a["var"], tree_of(a))
     return perm, row, planes, hung, a
 
 
@@ -136,11 +137,11 @@ def test_pivots_have_the_least_degree_of_their_group_and_are_the_last_beside_the
 @given(affected())
 def test_fronts_are_those_that_many_variables_have(few: Affected) -> None:
     perm, row, planes, hung, a = ordered(few)
-    fronts, found_lowest = analyze_few(len(few.kinds), perm, row, planes, hung, a["affected"], a["var"])
+    fronts, found_lowest = analyze_few(perm, row, planes, hung, a["affected"], a["var"], np.ones(WORDS, np.int64))
     label = np.argsort(perm)
-    lowest = find_lowest(label, a["orphans"], a["node"], a["clique"], a["lists"], a["state"])
+    lowest = find_lowest(label, a["orphans"], tree_of(a))
     rows, cols = list_pairs(graph_of(a), tree_of(a), lowest, a["factors"], a["orphans"])
-    wanted = analyze_affected(len(few.kinds), perm, a["affected"], a["var"], rows, cols)
+    wanted = analyze_affected(perm, a["affected"], a["var"], rows, cols, np.ones(1, np.int64))
     np.testing.assert_array_equal(found_lowest, lowest)
     for one, other in zip(fronts, wanted, strict=True):
         np.testing.assert_array_equal(one, other)

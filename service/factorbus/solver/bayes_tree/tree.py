@@ -21,6 +21,7 @@ from factorbus.solver.kernels.bayes_tree.remaining import remaining_decrement
 from factorbus.solver.kernels.bayes_tree.reset_estimate import reset_to_linearization
 from factorbus.solver.kernels.bayes_tree.step import tree_step
 from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.jit.scratch import WORDS
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.task_queue import NOBODY
@@ -35,7 +36,7 @@ class CliqueTree(Arenas):
     """R, d, δ and linearization points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
     ARENAS = records.Tree._fields
-    NOT_KEPT = ("_graph", "_rest", "settings", "marked", "array_table")
+    NOT_KEPT = ("_graph", "_rest", "settings", "marked", "scratch", "array_table")
 
     def __init__(self, graph: FactorGraph, options: Options) -> None:
         self._graph, self._rest = graph, options.tuning.relinearize_cooldown_steps
@@ -74,6 +75,7 @@ class CliqueTree(Arenas):
         self.changed: I64 = np.empty(256, np.int64)
         self.moved: I64 = np.empty(256, np.int64)
         self.marked: I64 = np.empty(256, np.int64)
+        self.scratch: I64 = np.empty(WORDS, np.int64)
         self.saved: F64 = np.empty((16, SAVED))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
         self.totals: F64 = np.zeros(tl.T_SIZE)

@@ -4,11 +4,10 @@ A factor changes the clique that eliminates the first of its variables, and with
 Of a clique only the frontals from the first touched one on are affected: the rows before stay as they are.
 """
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.scratch import take
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of
@@ -90,9 +89,10 @@ def separators_of(c: int, stamp: int, clique: I64) -> tuple:
 
 
 @part
-def gather_factors(n: int, affected: I64, f0: int, f1: int, node: I64, link: I64, fac: I64, var: I64) -> I64:
+def gather_factors(graph: Graph, tree: Tree, affected: I64, f0: int, f1: int) -> I64:
     """The factors whose variables are all affected: those that affected variables own, and the new ones f0 .. f1−1."""
-    count = 0
+    node, link, fac, var = tree.node, tree.link, graph.fac, graph.var
+    n, count = affected.size, 0
     for f in range(f0, f1):
         if has_free(f, var, fac):
             count += 1
@@ -101,7 +101,7 @@ def gather_factors(n: int, affected: I64, f0: int, f1: int, node: I64, link: I64
         while f >= 0:
             count += 1
             f = link[f, tl.L_OWN]
-    found, put = np.empty(count, np.int64), 0
+    found, put = take(count, tree.scratch), 0
     for k in range(n):
         f = node[affected[k], tl.N_OWN]
         while f >= 0:

@@ -15,6 +15,7 @@ from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.work import SOLVING, note_work, work_of_solving
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.prefetch import prefetch
+from factorbus.solver.kernels.jit.scratch import take, take_floats
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
@@ -45,15 +46,15 @@ def substitute(
     clique, lists, numbers, lin = tree.clique, tree.lists, tree.numbers, tree.lin
     scalars, motions = tree.scalars, tree.motions
     state, totals = tree.state, tree.totals
-    far, delta, weight, motion = wildfire_threshold * wildfire_threshold, scalars[0], scalars[1], np.empty(rg.SIZE)
+    far, delta, weight = wildfire_threshold * wildfire_threshold, scalars[0], scalars[1]
+    motion, shares = take_floats(rg.SIZE, tree.scratch), take_floats(64, tree.scratch)
     if wildfire_threshold == 0.0 and totals[tl.T_LEFT] > 0.0:
         far = -1.0
     motion[rg.LEFT] = 0.0
-    shares = np.empty(64)
     body = count = 0
     work, bounded = 0.0, budget < np.inf and state[tl.S_BEHIND] < MOST_TORN
     limit = max(budget - totals[tl.T_WORK], LEAST_SHARE * budget)
-    level = np.empty(len(clique) if bounded else 0, np.int64)
+    level = take(len(clique) if bounded else 0, tree.scratch)
     for turn in range(2 if bounded else 1):
         deepest = SURROUNDINGS if bounded and turn == 0 else ALL_LEVELS
         for f in range(ids.size - 1, -1, -1):

@@ -1,7 +1,5 @@
 """Before a step of the tree: room, good first values, and whether everything new is determined.  MATH §9.2."""
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.hessian_room import MOST_ROOM
 from factorbus.solver.kernels.bayes_tree.records import Tree
@@ -9,6 +7,7 @@ from factorbus.solver.kernels.graph.initialize import follow, reach
 from factorbus.solver.kernels.graph.local_init import initialize_new
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.records import table_of
+from factorbus.solver.kernels.jit.scratch import clear_scratch, take
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
@@ -19,6 +18,7 @@ def begin_step(graph: Graph, tree: Tree) -> int:
     var, fac, values, payload, counts = graph.var, graph.fac, graph.values, graph.payload, graph.counts
     settings, node, link, hessian, lin = tree.settings, tree.node, tree.link, tree.hessian, tree.lin
     scalars, saved, state = tree.scalars, tree.saved, tree.state
+    clear_scratch(tree.scratch)
     v0, v1, f0, f1 = state[tl.S_VARIABLES], counts[at.VARIABLES], state[tl.S_FACTORS], counts[at.FACTORS]
     if (
         v1 > len(node)
@@ -32,7 +32,7 @@ def begin_step(graph: Graph, tree: Tree) -> int:
     if v1 - v0 <= settings[tl.P_INITIALIZE]:
         initialize_new(v0, v1, f0, f1, settings[tl.P_CHI2_EPSILON], table_of(graph))
     if state[tl.S_CHECKED] == 0 and v1 > v0:
-        determined = np.empty(v1 - v0, np.int64)
+        determined = take(v1 - v0, tree.scratch)
         for v in range(v0, v1):
             determined[v - v0] = 1 if var[v, at.V_COLUMN] < 0 else 0
         if (

@@ -30,6 +30,7 @@ from factorbus.solver.kernels.bayes_tree.rigid_subtrees import is_invariant
 from factorbus.solver.kernels.jit.array_table import WIDTH, address_of, int_rows, ints, put_entry
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 from factorbus.solver.kernels.jit.records import table_of
+from factorbus.solver.kernels.jit.scratch import take, take_filled
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.sparse import fronts as fr
@@ -92,7 +93,7 @@ def eliminate_fronts(
     clique, state = tree.clique, tree.state
     orphans, records, count = affected.orphans, fronts.records, ids.size
     first_factor, factor_of = _by_front(graph, tree, count, affected.factors, fronts)
-    first_orphan, next_orphan = np.full(count, -1), np.empty(orphans.size, np.int64)
+    first_orphan, next_orphan = take_filled(count, -1, tree.scratch), take(orphans.size, tree.scratch)
     for e in range(orphans.size - 1, -1, -1):
         f = fronts.home[fronts.place[lowest[e]]]
         next_orphan[e], first_orphan[f] = first_orphan[f], e
@@ -103,7 +104,7 @@ def eliminate_fronts(
     for e in range(orphans.size):
         first, end = separators_of(orphans[e], state[tl.S_STAMP], clique)
         separators = max(separators, end - first)
-    plan = np.empty(PLAN, np.int64)
+    plan = take(PLAN, tree.scratch)
     plan[N], plan[MOST_PIVOTS], plan[MOST_SEPARATORS] = fronts.order.size, pivots, separators
     put_entry(plan, GRAPH, address_of(table_of(graph)), table_of(graph).size, 1)
     put_entry(plan, TREE, address_of(table_of(tree)), table_of(tree).size, 1)
@@ -273,13 +274,13 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, queue: I64) -> tupl
 def _by_front(graph: Graph, tree: Tree, count: int, factors: I64, fronts: Fronts) -> tuple[I64, I64]:
     """The factors sorted by the front that takes them in."""
     var, fac, node, home, place = graph.var, graph.fac, tree.node, fronts.home, fronts.place
-    begin, front = np.zeros(count + 2, np.int64), np.empty(factors.size, np.int64)
+    begin, front = take_filled(count + 2, 0, tree.scratch), take(factors.size, tree.scratch)
     for q in range(factors.size):
         front[q] = home[first_end(factors[q], place, var, fac, node)]
         begin[front[q] + 2] += 1
     for f in range(count):
         begin[f + 2] += begin[f + 1]
-    out = np.empty(factors.size, np.int64)
+    out = take(factors.size, tree.scratch)
     for q in range(factors.size):
         out[begin[front[q] + 1]] = factors[q]
         begin[front[q] + 1] += 1

@@ -27,6 +27,7 @@ from factorbus.solver.kernels.bayes_tree.work import RELINEARIZING, note_work, w
 from factorbus.solver.kernels.jit.bit_sets import MOST
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
+from factorbus.solver.kernels.jit.scratch import clear_scratch, take, take_rows
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
@@ -42,26 +43,27 @@ def eliminate_again(
     state, totals = tree.state, tree.totals
     # 3
     now = cycles()
+    clear_scratch(tree.scratch)
     touched = find_touched(graph, tree, new, moving, settings)
     cliques, orphans, variables, renewed = touched.cliques, touched.orphans, touched.variables, touched.renewed
     if variables.size == 0 and renewed.size == 0:
         add_constants(state[tl.S_TAKEN], new.f1, graph.var, graph.fac, link, tree.hessian, totals)
         return substitute_and_measure(graph, tree, renewed[:0], renewed[:0], settings)
     now = lap(now, tl.MARK, state)
-    old = np.empty((renewed.size, tl.C_WIDTH), np.int64)
+    old = take_rows(renewed.size, tl.C_WIDTH, tree.scratch)
     if renewed.size > 0:
         # Before the others, who take in their update matrices.
         status = renew(graph, tree, renewed, variables.size, totals[tl.T_LARGEST_DIAGONAL], old, queue)
         if status != tl.DONE:
             return 0.0, status
     now = lap(now, tl.ELIMINATE, state)
-    factors = gather_factors(variables.size, variables, state[tl.S_TAKEN], new.f1, node, link, graph.fac, graph.var)
+    factors = gather_factors(graph, tree, variables, state[tl.S_TAKEN], new.f1)
     now = lap(now, tl.MARK, state)
     # 4, 5
     affected = Affected(cliques, orphans, variables, factors)
     fronts, lowest = order_fronts(graph, tree, new, affected, moving.size, settings)
     now = cycles()
-    update = np.empty((orphans.size, 3), np.int64)
+    update = take_rows(orphans.size, 3, tree.scratch)
     if not update_orphans(graph, tree, orphans, update):
         give_back_renewed(renewed, old, clique, numbers, state)
         return 0.0, tl.NO_ROOM
@@ -106,12 +108,12 @@ def order_fronts(
 
     moving: how many variables are relinearized
     """
-    node, clique, lists, state = tree.node, tree.clique, tree.lists, tree.state
+    clique, state = tree.clique, tree.state
     variables, factors, orphans, n = affected.variables, affected.factors, affected.orphans, affected.variables.size
     now = cycles()
     if is_root_alone(affected.cliques, n, new.v1 - new.v0, variables, settings, graph.var, clique):
-        fronts = keep_root(n, variables, graph.var)
-        lowest = find_lowest(fronts.place, orphans, node, clique, lists, state)
+        fronts = keep_root(variables, graph.var, tree.scratch)
+        lowest = find_lowest(fronts.place, orphans, tree)
     else:
         # No loop closes and nothing else moves: worth what it may cost that the newest pose is in the root.
         is_odometry = new.f1 - state[tl.S_TAKEN] <= new.v1 - new.v0 and moving == 0 and state[tl.S_EDITED] == 0
@@ -119,18 +121,18 @@ def order_fronts(
         recent = int(settings[tl.P_RECENT_STEPS])
         if n <= MOST:
             near, hung = join_few(graph, tree, n, factors, orphans)
-            perm, row, planes = order_few(n, near, variables, recent, last, graph.var, node, state)
+            perm, row, planes = order_few(near, variables, recent, last, graph.var, tree)
             now = lap(now, tl.ORDER, state)
-            fronts, lowest = analyze_few(n, perm, row, planes, hung, variables, graph.var)
+            fronts, lowest = analyze_few(perm, row, planes, hung, variables, graph.var, tree.scratch)
         else:
             perm = order_affected(graph, tree, n, variables, factors, orphans, recent, last)
             label = np.empty(n, np.int64)
             for k in range(n):
                 label[perm[k]] = k
             now = lap(now, tl.ORDER, state)
-            lowest = find_lowest(label, orphans, node, clique, lists, state)
+            lowest = find_lowest(label, orphans, tree)
             rows, cols = list_pairs(graph, tree, lowest, factors, orphans)
-            fronts = analyze_affected(n, perm, variables, graph.var, rows, cols)
+            fronts = analyze_affected(perm, variables, graph.var, rows, cols, tree.scratch)
     lap(now, tl.SYMBOLIC, state)
     return fronts, lowest
 
@@ -164,13 +166,13 @@ def find_loose_end(var: I64, moved: I64, state: I64) -> int:
 @inline_kernel
 def substitute_and_measure(graph: Graph, tree: Tree, tops: I64, ids: I64, settings: F64) -> tuple[float, int]:
     """Steps 8 and 9, from the renewed cliques `tops` and the new ones `ids`, or from all roots."""
-    node, clique, state, totals = tree.node, tree.clique, tree.state, tree.totals
+    state, totals = tree.state, tree.totals
     now = cycles()
     behind = state[tl.S_BEHIND] != 0 and (state[tl.S_ROOTS] > 1 or tops.size + ids.size == 0)
     if state[tl.S_CONTINUES] != 0 or behind:
-        begins = list_all_roots(node, clique, state)
+        begins = list_all_roots(tree)
     else:
-        begins = np.empty(tops.size + ids.size, np.int64)
+        begins = take(tops.size + ids.size, tree.scratch)
         for k in range(begins.size):
             begins[k] = tops[k] if k < tops.size else ids[k - tops.size]
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
@@ -194,9 +196,10 @@ def follow_up(graph: Graph, tree: Tree, settings: F64) -> float:
 
 
 @part
-def list_all_roots(node: I64, clique: I64, state: I64) -> I64:
+def list_all_roots(tree: Tree) -> I64:
     """All roots of the tree."""
-    roots, n = np.empty(state[tl.S_ROOTS], np.int64), 0
+    node, clique, state = tree.node, tree.clique, tree.state
+    roots, n = take(state[tl.S_ROOTS], tree.scratch), 0
     for v in range(state[tl.S_VARIABLES]):
         c = node[v, tl.N_CLIQUE]
         if c >= 0 and node[v, tl.N_PLACE] == 0 and clique[c, tl.C_PARENT] < 0:

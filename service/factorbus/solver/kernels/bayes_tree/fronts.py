@@ -15,6 +15,7 @@ from factorbus.solver.kernels.bayes_tree.allocator import (
 )
 from factorbus.solver.kernels.bayes_tree.records import Fronts, Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.scratch import take, take_filled
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.symbolic import (
     arrange_fronts,
@@ -28,34 +29,38 @@ from factorbus.solver.kernels.sparse.symbolic import (
 
 
 @part
-def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols: I64) -> Fronts:
-    """The fronts of n affected variables eliminated in the order perm, or in one with the same fill."""
+def analyze_affected(perm: I64, affected: I64, var: I64, rows: I64, cols: I64, scratch: I64) -> Fronts:
+    """The fronts of the affected variables eliminated in the order perm (n,), or in one with the same fill."""
+    n = perm.size
     label, dim = np.empty(n, np.int64), np.empty(n, np.int64)
     for k in range(n):
         label[perm[k]], dim[k] = k, dim_of_variable(var, affected[perm[k]])
     begin, earlier = by_later(n, label, rows, cols)
     parent = elimination_tree(n, begin, earlier)
     variables, scalars = count_rows(n, begin, earlier, parent, dim)
-    order, home, tops, records = join_fronts(n, perm, parent, dim, scalars, affected, var, label)
+    order, home, tops, records = join_fronts(perm, parent, dim, scalars, affected, var, label, scratch)
     begin, earlier = by_later(n, label, rows, cols)
     separator_at, separator_of = list_separators(n, begin, earlier, home, tops, variables, records)
     return Fronts(order, label, home, records, separator_at, separator_of)
 
 
 @part
-def join_fronts(n: int, perm: I64, parent: I64, dim: I64, scalars: I64, affected: I64, var: I64, label: I64) -> tuple:
+def join_fronts(
+    perm: I64, parent: I64, dim: I64, scalars: I64, affected: I64, var: I64, label: I64, scratch: I64
+) -> tuple:
     """order, home, tops as `arrange_fronts` gives them, and the records; label becomes the place of each variable.
 
     dim, scalars (n,): of row k of R, on its diagonal and off it
     """
-    top_of, pivots = join_columns(n, parent, dim, scalars)
-    order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of)
-    first_scalar = np.empty(n + 1, np.int64)
+    n = perm.size
+    top_of, pivots = join_columns(n, parent, dim, scalars, scratch)
+    order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of, scratch)
+    first_scalar = take(n + 1, scratch)
     first_scalar[0] = 0
     for k in range(n):
         label[order[k]] = k
         first_scalar[k + 1] = first_scalar[k] + dim_of_variable(var, affected[order[k]])
-    return order, home, tops, make_records(tops, home, parent, front_of, pivots, scalars, first_scalar)
+    return order, home, tops, make_records(tops, home, parent, front_of, pivots, scalars, first_scalar, scratch)
 
 
 @inline_kernel
@@ -70,15 +75,16 @@ def is_root_alone(marked: I64, n: int, new: int, affected: I64, settings: F64, v
 
 
 @part
-def keep_root(n: int, affected: I64, var: I64) -> Fronts:
+def keep_root(affected: I64, var: I64, scratch: I64) -> Fronts:
     """As `analyze_affected`: one front of all affected variables, in the order they have."""
-    records = np.zeros((1, fr.FRONT), np.int64)
-    order, home = np.empty(n, np.int64), np.zeros(n, np.int64)
+    n = affected.size
+    records = take_filled(fr.FRONT, 0, scratch).reshape((1, fr.FRONT))
+    order, home = take(n, scratch), take_filled(n, 0, scratch)
     for k in range(n):
         order[k] = k
         records[0, fr.PIVOTS] += dim_of_variable(var, affected[k])
     records[0, fr.PARENT] = records[0, fr.CHILD] = records[0, fr.SIBLING] = -1
-    return Fronts(order, order, home, records, np.zeros(2, np.int64), np.empty(0, np.int64))
+    return Fronts(order, order, home, records, take_filled(2, 0, scratch), take(0, scratch))
 
 
 @inline_kernel
@@ -102,7 +108,7 @@ def place_fronts(tree: Tree, fronts: Fronts, affected: I64) -> tuple:
     clique, lists, numbers, state = tree.clique, tree.lists, tree.numbers, tree.state
     records, order, separator_at, separator_of = fronts.records, fronts.order, fronts.separator_at, fronts.separator_of
     count = len(records)
-    ids, n = np.empty(count, np.int64), order.size
+    ids, n = take(count, tree.scratch), order.size
     if not fronts_fit(records, separator_at, n, clique, lists, numbers, state):
         return ids, False
     for f in range(count):

@@ -11,6 +11,7 @@ from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, separa
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.reroot import MOST_RINGS
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
+from factorbus.solver.kernels.jit.scratch import take
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import is_pose
@@ -123,9 +124,10 @@ def find_newest(count: int, var: I64) -> int:
 
 
 @part
-def find_lowest(label: I64, orphans: I64, node: I64, clique: I64, lists: I64, state: I64) -> I64:
+def find_lowest(label: I64, orphans: I64, tree: Tree) -> I64:
     """Each orphan's first variable to go, label (n,) being the place in the order."""
-    lowest = np.empty(orphans.size, np.int64)
+    node, clique, lists, state = tree.node, tree.clique, tree.lists, tree.state
+    lowest = take(orphans.size, tree.scratch)
     for e in range(orphans.size):
         start = clique[orphans[e], tl.C_LIST]
         first, end = separators_of(orphans[e], state[tl.S_STAMP], clique)

@@ -9,8 +9,6 @@ MATH §9.4.
 Variables are the local ones of an elimination, 0 to n − 1; n is `bits.MOST` at most.
 """
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, separators_of
 from factorbus.solver.kernels.bayes_tree.fronts import join_fronts
@@ -18,6 +16,7 @@ from factorbus.solver.kernels.bayes_tree.order import ends_of, group_of
 from factorbus.solver.kernels.bayes_tree.records import Fronts, Tree
 from factorbus.solver.kernels.jit.bit_sets import count_bits, highest_bit, lowest_bit
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
+from factorbus.solver.kernels.jit.scratch import take, take_filled
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import MOST_SCALARS
 
@@ -30,7 +29,7 @@ def join_few(graph: Graph, tree: Tree, n: int, factors: I64, orphans: I64) -> tu
     """near (n,): who is next to each variable; hung: each orphan's separator."""
     var, fac = graph.var, graph.fac
     node, clique, lists, state = tree.node, tree.clique, tree.lists, tree.state
-    near, hung = np.empty(n, np.int64), np.empty(orphans.size, np.int64)
+    near, hung = take(n, tree.scratch), take(orphans.size, tree.scratch)
     for k in range(n):
         near[k] = 1 << k
     for q in range(factors.size):
@@ -51,22 +50,21 @@ def join_few(graph: Graph, tree: Tree, n: int, factors: I64, orphans: I64) -> tu
 
 
 @part
-def order_few(
-    n: int, near: I64, affected: I64, recent: int, last: int, var: I64, node: I64, state: I64
-) -> tuple[I64, I64, I64]:
+def order_few(near: I64, affected: I64, recent: int, last: int, var: I64, tree: Tree) -> tuple[I64, I64, I64]:
     """perm (n,), as of `order_affected`; row (n,): what row k of R has off its diagonal; planes: for `scalars_in`.
 
     near is used up.
     """
-    planes, group, degree = np.zeros(PLANES, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    total = 0
+    node, state, scratch = tree.node, tree.state, tree.scratch
+    n, total = near.size, 0
+    planes, group, degree = take_filled(PLANES, 0, scratch), take(n, scratch), take(n, scratch)
     for k in range(n):
         dim = dim_of_variable(var, affected[k])
         total += dim
         for p in range(PLANES):
             planes[p] |= (dim >> p & 1) << k
         group[k] = group_of(affected[k], recent, last, node, state)
-    perm, row, queue = np.empty(n, np.int64), np.empty(n, np.int64), np.zeros(total + 1, np.int64)
+    perm, row, queue = take(n, scratch), take(n, scratch), take_filled(total + 1, 0, scratch)
     left, own, placed = (1 << n) - 1, 0, 0
     while left != 0:
         members = first_group(left, group)
@@ -125,18 +123,20 @@ def scalars_in(word: int, planes: I64) -> int:
 
 
 @part
-def analyze_few(n: int, perm: I64, row: I64, planes: I64, hung: I64, affected: I64, var: I64) -> tuple[Fronts, I64]:
+def analyze_few(
+    perm: I64, row: I64, planes: I64, hung: I64, affected: I64, var: I64, scratch: I64
+) -> tuple[Fronts, I64]:
     """As `analyze_affected`, and lowest: each orphan's first variable to go."""
-    label, dim, parent = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    separator = np.empty(n, np.int64)
+    n = perm.size
+    label, dim, parent, separator = take(n, scratch), take(n, scratch), take(n, scratch), take(n, scratch)
     for k in range(n):
         label[perm[k]], dim[k] = k, dim_of_variable(var, affected[perm[k]])
     for k in range(n):
         separator[k] = scalars_in(row[k], planes)
         parent[k] = label[first_to_go(row[k], label)] if row[k] != 0 else NONE
-    order, home, tops, records = join_fronts(n, perm, parent, dim, separator, affected, var, label)
-    separator_at, separator_of = list_small_separators(tops, row, label)
-    lowest = np.empty(hung.size, np.int64)
+    order, home, tops, records = join_fronts(perm, parent, dim, separator, affected, var, label, scratch)
+    separator_at, separator_of = list_small_separators(tops, row, label, scratch)
+    lowest = take(hung.size, scratch)
     for e in range(hung.size):
         lowest[e] = first_to_go(hung[e], label)
     return Fronts(order, label, home, records, separator_at, separator_of), lowest
@@ -156,12 +156,13 @@ def first_to_go(word: int, label: I64) -> int:
 
 
 @inline_kernel
-def list_small_separators(tops: I64, row: I64, label: I64) -> tuple:
+def list_small_separators(tops: I64, row: I64, label: I64, scratch: I64) -> tuple:
     """separator_at, separator_of: the labels of each front's separator, ascending."""
-    separator_at = np.zeros(tops.size + 1, np.int64)
+    separator_at = take(tops.size + 1, scratch)
+    separator_at[0] = 0
     for f in range(tops.size):
         separator_at[f + 1] = separator_at[f] + count_bits(row[tops[f]])
-    separator_of, put = np.empty(separator_at[tops.size], np.int64), 0
+    separator_of, put = take(separator_at[tops.size], scratch), 0
     for f in range(tops.size):
         rest, there = row[tops[f]], 0
         while rest != 0:

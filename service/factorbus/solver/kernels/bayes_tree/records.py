@@ -34,6 +34,7 @@ class Tree(NamedTuple):
     saved   (2 k, SAVED) float64 what the k factors of a step under way change of their variables, for when it fails
     state   int64            counters and the heads of free lists
     totals  (21,) float64    χ² and sums of errors over all factors, and bounds that follow from them
+    scratch int64            room for short arrays, see `jit/scratch.py`
     """
 
     settings: Floats
@@ -55,6 +56,7 @@ class Tree(NamedTuple):
     saved: FloatRows
     state: Ints
     totals: Floats
+    scratch: Ints
 
 
 class Affected(NamedTuple):

@@ -4,13 +4,12 @@ A step changes all cliques from those that its factors touch up to the root.  Wh
 these are few and small, however large the map is.
 """
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, touch
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.scratch import take
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
@@ -58,7 +57,7 @@ def touch_near(graph: Graph, tree: Tree, room: int, f1: int, settings: F64, mark
     """
     var, fac = graph.var, graph.fac
     node, link, clique, state = tree.node, tree.link, tree.clique, tree.state
-    stamp, queue, put, taken = state[tl.S_STAMP], np.empty(room, np.int64), 0, 0
+    stamp, queue, put, taken = state[tl.S_STAMP], take(room, tree.scratch), 0, 0
     max_extra, wider = (
         settings[tl.P_REROOT_MAX_EXTRA] * flops_of(marked[:count], clique),
         settings[tl.P_REROOT_RING_RATIO],

@@ -3,8 +3,6 @@
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
 from factorbus.solver.kernels.bayes_tree.affected import detach, touch
@@ -12,6 +10,7 @@ from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import is_worth_ordering, mark_renewed, still_renewed
 from factorbus.solver.kernels.bayes_tree.reroot import count_near, touch_near
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.scratch import take
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
@@ -73,7 +72,7 @@ def find_touched(graph: Graph, tree: Tree, new: NewRows, moving: I64, settings: 
         while child >= 0:
             hanging += 1
             child = clique[child, tl.C_NEXT]
-    variables, orphans = np.empty(room, np.int64), np.empty(hanging, np.int64)
+    variables, orphans = take(room, tree.scratch), take(hanging, tree.scratch)
     n, hanging = detach(graph, tree, cliques, settings, variables, orphans)
     for v in range(new.v0, new.v1):
         if var[v, at.V_COLUMN] >= 0:

@@ -20,6 +20,12 @@ from factorbus.solver.kernels.model.sizes import MOST_SCALARS, dim_of, informati
 
 _ITERATIONS = 5
 _MOST = max(MOST_SCALARS, 7)  # numbers of a value, and scalars
+# Where in the scratch of a variable what begins: M at 0, z, the step, the value before it, and r, H, W of a factor.
+_Z = _MOST * _MOST
+_STEP, _BEFORE, _R = _Z + _MOST, _Z + 2 * _MOST, _Z + 3 * _MOST
+_H = _R + at.R_SIZE
+_W = _H + 72
+_ROOM = _W + 36
 
 
 class _Linear(NamedTuple):
@@ -40,15 +46,16 @@ def initialize_new(v0: int, v1: int, f0: int, f1: int, least: float, graph_table
     graph = graph_at(graph_table)
     for v in range(v0, v1):
         if graph.var[v, at.V_COLUMN] >= 0 and is_seen_twice(v, f0, f1, graph.fac):
-            initialize_variable(v, f0, f1, least, graph)
+            initialize_variable(v, f0, f1, least, graph, np.empty(_ROOM))
 
 
 @part
-def initialize_variable(v: int, f0: int, f1: int, least: float, graph: Graph) -> None:
-    """The same for one variable."""
+def initialize_variable(v: int, f0: int, f1: int, least: float, graph: Graph, room: F64) -> None:
+    """The same for one variable; room (_ROOM,) is scratch."""
     var, values = graph.var, graph.values
-    M, z, step, before = np.empty((_MOST, _MOST)), np.empty(_MOST), np.empty(_MOST), np.empty(_MOST)
-    linear = _Linear(np.empty(at.R_SIZE), np.empty((2, 6, 6)), np.empty((6, 6)))
+    M, z = room[:_Z].reshape((_MOST, _MOST)), room[_Z:_STEP]
+    step, before = room[_STEP:_BEFORE], room[_BEFORE:_R]
+    linear = _Linear(room[_R:_H], room[_H:_W].reshape((2, 6, 6)), room[_W:_ROOM].reshape((6, 6)))
     x, kind = var[v, at.V_AT], var[v, at.V_KIND]
     dim, size = dim_of(kind), size_of(kind)
     chi2 = gather_system(v, f0, f1, graph, linear, M, z)

@@ -8,6 +8,7 @@ joined so far, or a chain would collapse into one giant front.
 import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.jit.scratch import take, take_filled
 from factorbus.solver.kernels.sparse import fronts as fr
 
 NONE = -1
@@ -34,8 +35,9 @@ def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
     begin, earlier = by_later(n, label, rows, cols)
     parent = elimination_tree(n, begin, earlier)
     variables, scalars = count_rows(n, begin, earlier, parent, dim)
-    top_of, pivots = join_columns(n, parent, dim, scalars)
-    order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of)
+    scratch = np.ones(1, np.int64)  # no room: arrays of their own
+    top_of, pivots = join_columns(n, parent, dim, scalars, scratch)
+    order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of, scratch)
     work = _work(n, dim, scalars)
 
     first_scalar = np.empty(n + 1, np.int64)
@@ -43,7 +45,7 @@ def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
     for k in range(n):
         label[order[k]], dim[k] = k, dims[order[k]]
         first_scalar[k + 1] = first_scalar[k] + dim[k]
-    records = make_records(tops, home, parent, front_of, pivots, scalars, first_scalar)
+    records = make_records(tops, home, parent, front_of, pivots, scalars, first_scalar, scratch)
     sizes = _place(records)
     begin, earlier = by_later(n, label, rows, cols)
     separator_at, separator_of = list_separators(n, begin, earlier, home, tops, variables, records)
@@ -106,11 +108,11 @@ def count_rows(n: int, begin: I64, earlier: I64, parent: I64, dim: I64) -> tuple
 
 
 @part
-def join_columns(n: int, parent: I64, dim: I64, separator: I64) -> tuple[I64, I64]:
+def join_columns(n: int, parent: I64, dim: I64, separator: I64, scratch: I64) -> tuple[I64, I64]:
     """Join columns into fronts: the last column of each column's front, and the pivot scalars of that front."""
-    into, pivots, entries = np.empty(n, np.int64), dim.copy(), np.empty(n, np.int64)
+    into, pivots, entries = take(n, scratch), take(n, scratch), take(n, scratch)
     for k in range(n):
-        into[k] = k
+        into[k], pivots[k] = k, dim[k]
         entries[k] = dim[k] * (dim[k] + 1) // 2 + dim[k] * separator[k]
     for relaxed in range(2):
         for k in range(n):
@@ -138,19 +140,19 @@ def _top(into: I64, k: int) -> int:
 
 
 @part
-def arrange_fronts(n: int, perm: I64, parent: I64, top_of: I64) -> tuple[I64, I64, I64, I64]:
+def arrange_fronts(n: int, perm: I64, parent: I64, top_of: I64, scratch: I64) -> tuple[I64, I64, I64, I64]:
     """Number the fronts in postorder, their columns one after another.
 
     order (n,): the variables so   home (n,): the front of each   tops: the old last column of each front
     front_of (n,): the front of each old last column
     """
-    child, sibling, count = np.full(n, NONE), np.full(n, NONE), np.zeros(n, np.int64)
+    child, sibling, count = take_filled(n, NONE, scratch), take_filled(n, NONE, scratch), take_filled(n, 0, scratch)
     for k in range(n - 1, -1, -1):
         count[top_of[k]] += 1
         if top_of[k] == k and parent[k] != NONE:
             above = top_of[parent[k]]
             sibling[k], child[above] = child[above], k
-    front_of, tops, put, fronts, placed = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64), 0, 0
+    front_of, tops, put, fronts, placed = take(n, scratch), take(n, scratch), take(n, scratch), 0, 0
     for root in range(n):
         if top_of[root] != root or parent[root] != NONE:
             continue
@@ -165,7 +167,7 @@ def arrange_fronts(n: int, perm: I64, parent: I64, top_of: I64) -> tuple[I64, I6
                 placed += count[k]
                 fronts += 1
                 k = top_of[parent[k]] if parent[k] != NONE else NONE
-    order, home = np.empty(n, np.int64), np.empty(n, np.int64)
+    order, home = take(n, scratch), take(n, scratch)
     for k in range(n):
         t = top_of[k]
         order[put[t]], home[put[t]] = perm[k], front_of[t]
@@ -188,10 +190,10 @@ def _work(n: int, dim: I64, separator: I64) -> F64:
 
 @part
 def make_records(
-    tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, separator: I64, first_scalar: I64
+    tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, separator: I64, first_scalar: I64, scratch: I64
 ) -> I64:
     """The front records without places and maps."""
-    records = np.zeros((tops.size, fr.FRONT), np.int64)
+    records = take_filled(tops.size * fr.FRONT, 0, scratch).reshape((tops.size, fr.FRONT))
     for k in range(home.size - 1, -1, -1):
         records[home[k], fr.VARIABLE], records[home[k], fr.COLUMN] = k, first_scalar[k]
     for f in range(tops.size - 1, -1, -1):
