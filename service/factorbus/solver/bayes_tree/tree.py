@@ -75,7 +75,7 @@ class CliqueTree(Arenas):
         self.changed: I64 = np.empty(256, np.int64)
         self.moved: I64 = np.empty(256, np.int64)
         self.marked: I64 = np.empty(256, np.int64)
-        self.scratch: I64 = np.empty(WORDS, np.int64)
+        self.scratch: I64 = np.ones(WORDS, np.int64)
         self.saved: F64 = np.empty((16, SAVED))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
         self.totals: F64 = np.zeros(tl.T_SIZE)
