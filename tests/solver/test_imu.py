@@ -24,6 +24,7 @@ from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.linearized import Linearized, linearized_factor
 from factorbus.solver.kernels.model.imu_layout import ImuLayout, imu_layout
 from factorbus.solver.kernels.model.imu_noise import propagate_noise
+from factorbus.solver.kernels.model.imu_walk import walk_samples
 from factorbus.solver.kernels.model.preintegration import (
     ROOM_T,
     Preintegrated,
@@ -77,7 +78,7 @@ def test_residual_and_jacobians_are_those_of_the_dense_twin(name: str, seed: int
     scale = np.abs(twin).max()
     np.testing.assert_allclose(found.r, twin, atol=1e-7 * scale)
     for n, J in enumerate(jacobians(name, list(form.ends), ends, z, 1e-4)):
-        np.testing.assert_allclose(found.jacobian_of(n), J, atol=2e-7 * max(np.abs(J).max(), scale))
+        np.testing.assert_allclose(found.jacobian_of(n), J, atol=5e-7 * max(np.abs(J).max(), scale))
 
 
 @given(seed=seeds)
@@ -132,7 +133,7 @@ def test_what_is_integrated_is_gtsams_on_a_thousand_sequences() -> None:
         turned = np.eye(9)  # GTSAM's errors of position and velocity are in the frame where the samples end
         turned[3:6, 3:6] = turned[6:, 6:] = R.T
         wanted = theirs.preintMeasCov()
-        found = turned @ propagate_noise(layout_of(sampled(z)), z) @ turned.T
+        found = turned @ propagate_noise(z, walk_samples(layout_of(sampled(z)), z)) @ turned.T
         np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
 
 
@@ -202,7 +203,9 @@ def direction(rng: np.random.Generator) -> np.ndarray:
 def test_the_noise_is_what_noise_of_each_sample_does() -> None:
     z = random_imu(ImuForm(6), np.random.default_rng(1))
     wanted = covariance(sampled(z), z)
-    np.testing.assert_allclose(propagate_noise(layout_of(sampled(z)), z), wanted, atol=1e-8 * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        propagate_noise(z, walk_samples(layout_of(sampled(z)), z)), wanted, atol=1e-8 * np.abs(wanted).max()
+    )
 
 
 @pytest.mark.parametrize("given", [3, 4, 5])

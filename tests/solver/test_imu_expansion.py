@@ -18,6 +18,7 @@ from factorbus.solver.kernels.model.imu_expansion import (
 )
 from factorbus.solver.kernels.model.imu_layout import ImuLayout, imu_layout
 from factorbus.solver.kernels.model.imu_noise import write_root
+from factorbus.solver.kernels.model.imu_walk import walk_samples
 from factorbus.solver.kernels.model.preintegration import (
     ROOM_P,
     ROOM_Q,
@@ -38,8 +39,9 @@ def admitted(rng: np.random.Generator) -> tuple[ImuLayout, np.ndarray]:
     form, layout = ImuForm(SAMPLES), imu_layout(SAMPLES, False, of.MOMENTS)
     z = np.concatenate([random_imu(form, rng, 0.5), np.zeros(of.KEPT)])
     z[form.start : form.size : of.SAMPLE] = 1.0 / SAMPLES
-    assert write_root(layout, z, form.size, z)
-    write_expansion(layout, z)
+    walk = walk_samples(layout, z)
+    assert write_root(z, walk, form.size, z)
+    write_expansion(layout, z, walk)
     return layout, z
 
 
@@ -126,5 +128,5 @@ def test_near_a_bias_that_moved_the_second_order_is_there() -> None:
 def test_of_a_bias_without_digits_for_a_step_samples_are_integrated() -> None:
     layout, z = admitted(np.random.default_rng(5))
     z[BIAS] = 1e11
-    write_expansion(layout, z)
+    write_expansion(layout, z, walk_samples(layout, z))
     assert not expand_delta(layout, z, z[BIAS], make_room())

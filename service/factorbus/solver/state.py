@@ -24,7 +24,7 @@ State: TypeAlias = dict[str, Any]
 # One more whenever a state of before cannot be gone on from: a part, its type, the width of a row, the place or the
 # meaning of a number has changed (`kernels/model/layout.py`, `kernels/bayes_tree/layout.py`).
 # tests/service/test_state_format.py notices all of these but meanings, and says how to note the new one.
-FORMAT = 19
+FORMAT = 20
 
 _PLAIN = (bool, int, float, str, type(None))
 _TYPE = "type"

@@ -4,6 +4,11 @@ import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
+from factorbus.solver.kernels.bayes_tree.correct_inertial import (
+    correct_inertial,
+    is_inertial_and_plain,
+    is_off_its_point,
+)
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import chi2_of_factor, heading_of
 from factorbus.solver.kernels.bayes_tree.hessian import linearize_factor, weigh_factor
 from factorbus.solver.kernels.bayes_tree.hessian_room import jacobian_size, kept_samples, last_of_hessian
@@ -78,6 +83,8 @@ def add_factors(graph: Graph, tree: Tree, f1: int) -> bool:
         if j >= 0:
             _save(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)
         weigh_factor(graph, tree, f, scratch)
+        if is_inertial_and_plain(f, graph, tree) and is_off_its_point(f, graph, tree):
+            correct_inertial(f, graph, tree)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
         totals[tl.T_LARGEST_DIAGONAL] = max(totals[tl.T_LARGEST_DIAGONAL], largest_diagonal_of(i, var, scalars))
         if j >= 0:

@@ -3,6 +3,8 @@
 MATH §9.5, and §9.3 for what is split.
 """
 
+from typing import NamedTuple
+
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.allocator import give_numbers, size_class, take_numbers
@@ -12,6 +14,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import TILE_ROWS, Block, Panel, add_run, put, zero
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import head_of, is_member
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.panels import take_off
@@ -20,6 +23,15 @@ from factorbus.solver.kernels.sparse.partial_cholesky import DAMPING, LEAST_PIVO
 # Columns of `update`, a row for each orphan: where its update matrix is, its width, and the size of its block where it
 # was made for this elimination, else 0.
 UPDATE_AT, UPDATE_WIDTH, UPDATE_SIZE = range(3)
+
+
+class Pair(NamedTuple):
+    """How many scalars the two variables of a row have, and the first column of each in a front; −1: none."""
+
+    di: int
+    dj: int
+    ci: int
+    cj: int
 
 
 @inline_kernel
@@ -94,6 +106,10 @@ def add_hessian(graph: Graph, tree: Tree, f: int, row: I64, column: I64) -> None
     dj = dim_of_variable(var, j) if j >= 0 else 0
     ci = column[node[i, tl.N_LOCAL]] if var[i, at.V_COLUMN] >= 0 else -1
     cj = column[node[j, tl.N_LOCAL]] if j >= 0 and var[j, at.V_COLUMN] >= 0 else -1
+    if is_member(f, fac):
+        has_second = fac[f, at.F_I] == fac[head_of(f, fac), at.F_I]
+        add_member(has_second, Pair(di, dj, int(ci), int(cj)), link[f, tl.L_AT], row, hessian, numbers)
+        return
     # Sizes as constants, so that each call becomes straight code.
     if di == 3 and dj == 3:
         _add_blocks(3, 3, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
@@ -101,6 +117,8 @@ def add_hessian(graph: Graph, tree: Tree, f: int, row: I64, column: I64) -> None
         _add_blocks(6, 6, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
     elif di == 3 and dj == 2:
         _add_blocks(3, 2, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+    elif di == 6 and dj == 3:
+        _add_blocks(6, 3, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
     else:
         _add_blocks(di, dj, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
 
@@ -115,19 +133,51 @@ def _add_blocks(di: int, dj: int, ci: int, cj: int, h: int, row: I64, hessian: F
     if cj >= 0:
         _add_diagonal(dj, cj, last, h + di * di + di * dj, g + di, row, hessian, numbers)
     if ci >= 0 and cj >= 0:
-        h += di * di
-        if ci < cj:
-            for a in range(di):
-                target = row_of(ci + a, row) + cj
-                for b in range(dj):
-                    put(numbers, target + b, load(numbers, target + b) + load(hessian, h + a * dj + b))
-        else:
-            for b in range(dj):
-                target = row_of(cj + b, row) + ci
-                for a in range(di):
-                    put(numbers, target + a, load(numbers, target + a) + load(hessian, h + a * dj + b))
+        _add_across(di, dj, ci, cj, h + di * di, row, hessian, numbers)
     corner = row_of(last, row) + last
     put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
+
+
+@part
+def add_member(has_second: bool, pair: Pair, h: int, row: I64, hessian: F64, numbers: F64) -> None:
+    """The same of a further row of a factor: the block across, and what it has of its second variable where the first
+    is that of the factor.  All else in such a row is zero (`hessian_of_many`).
+    """
+    di, dj, ci, cj = pair
+    across = h + di * di
+    if ci >= 0 and cj >= 0:
+        if di == 6 and dj == 6:
+            _add_across(6, 6, ci, cj, across, row, hessian, numbers)
+        elif di == 6 and dj == 3:
+            _add_across(6, 3, ci, cj, across, row, hessian, numbers)
+        elif di == 3 and dj == 6:
+            _add_across(3, 6, ci, cj, across, row, hessian, numbers)
+        elif di == 3 and dj == 3:
+            _add_across(3, 3, ci, cj, across, row, hessian, numbers)
+        else:
+            _add_across(di, dj, ci, cj, across, row, hessian, numbers)
+    if has_second and cj >= 0:
+        last, second = row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS], across + di * dj
+        if dj == 6:
+            _add_diagonal(6, cj, last, second, second + 36 + di, row, hessian, numbers)
+        elif dj == 3:
+            _add_diagonal(3, cj, last, second, second + 9 + di, row, hessian, numbers)
+        else:
+            _add_diagonal(dj, cj, last, second, second + dj * dj + di, row, hessian, numbers)
+
+
+@inline_kernel
+def _add_across(di: int, dj: int, ci: int, cj: int, h: int, row: I64, hessian: F64, numbers: F64) -> None:
+    if ci < cj:
+        for a in range(di):
+            target = row_of(ci + a, row) + cj
+            for b in range(dj):
+                put(numbers, target + b, load(numbers, target + b) + load(hessian, h + a * dj + b))
+    else:
+        for b in range(dj):
+            target = row_of(cj + b, row) + ci
+            for a in range(di):
+                put(numbers, target + a, load(numbers, target + a) + load(hessian, h + a * dj + b))
 
 
 @inline_kernel

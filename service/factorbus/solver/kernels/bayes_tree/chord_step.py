@@ -21,6 +21,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import last_of_hessian
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.back_substitute import QUIET, substitute
+from factorbus.solver.kernels.bayes_tree.correct_inertial import correct_inertial, is_inertial_and_plain
 from factorbus.solver.kernels.bayes_tree.eliminate_again import lap
 from factorbus.solver.kernels.bayes_tree.linearization_error import measure
 from factorbus.solver.kernels.bayes_tree.missed_residual import missed_se2, missed_se3, turn_since_linearized
@@ -34,6 +35,7 @@ from factorbus.solver.kernels.jit.cycle_counter import cycles
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_one_of_many
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se3 import rotation_matrix, turn_slope
@@ -44,9 +46,10 @@ FORWARD = 2.0  # times what back-substitution takes: the gradients are gathered 
 
 
 @inline_kernel
-def is_correctable(f: int, link: I64) -> bool:
-    """Whether what the model of factor f misses is known as a vector: between poses, without a loss."""
-    return link[f, tl.L_KIND] == at.BETWEEN_SE2 or link[f, tl.L_KIND] == at.BETWEEN_SE3
+def is_correctable(f: int, graph: Graph, tree: Tree) -> bool:
+    """Whether what the model of factor f misses is known as a vector: between poses, or of an IMU, without a loss."""
+    kind = tree.link[f, tl.L_KIND]
+    return kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3 or is_inertial_and_plain(f, graph, tree)
 
 
 @part
@@ -70,11 +73,11 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     state[tl.S_STAMP] += 1
     corrected, count, end = np.empty(state[tl.S_FACTORS], np.int64), 0, tree.marked.size
     for f in range(state[tl.S_FACTORS]):
-        if tree.factor_errors[f, tl.E_ERROR] > least and is_correctable(f, tree.link):
+        if tree.factor_errors[f, tl.E_ERROR] > least and is_correctable(f, graph, tree):
             corrected[count] = f
             count += 1
-            for a in range(2):
-                end = mark_above(graph.fac[f, at.F_I + a], node, clique, state, tree.marked, end)
+            for n in range(count_ends(f, graph.fac)):
+                end = mark_above(end_of(f, n, graph.fac), node, clique, state, tree.marked, end)
     marked = tree.marked[end:].copy()
     work = work_of_solving_all(marked, clique)
     if tree.totals[tl.T_WORK] + (FORWARD + 1.0) * work > settings[tl.P_BUDGET]:
@@ -83,8 +86,8 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
     scratch = make_scratch()
     for k in range(count):
         correct_factor(graph, tree, corrected[k], scratch)
-        for a in range(2):
-            note_moved(MODEL, graph.fac[corrected[k], at.F_I + a], node, tree.moved, state)
+        for n in range(count_ends(corrected[k], graph.fac)):
+            note_moved(MODEL, end_of(corrected[k], n, graph.fac), node, tree.moved, state)
     now = lap(now, tl.LINEARIZE, state)
     # 2
     note_work(FORWARD * work, tree.totals)
@@ -104,6 +107,9 @@ def chord_step(least: float, graph: Graph, tree: Tree, settings: F64) -> float:
 def correct_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     """The gradient of factor f, −J₀ᵀ Ω (r₀ + m), and its (r₀ + m)ᵀ Ω (r₀ + m), with m as it is at the estimate."""
     row = tree.factor_errors[f]
+    if is_one_of_many(f, graph.fac):
+        correct_inertial(f, graph, tree)
+        return
     if graph.fac[f, at.F_KIND] == at.BETWEEN_SE2:
         correct_se2(graph, tree, f, scratch)
     else:

@@ -7,6 +7,7 @@ most common are asked for first.
 import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.correct_inertial import is_inertial_and_plain
 from factorbus.solver.kernels.bayes_tree.error_terms import (
     LINKS,
     SEEN,
@@ -71,6 +72,8 @@ def evaluate_factor(
             error = min(error, MOST_ERROR)
             full = min(error + force, MOST_ERROR)
             leaves = full = full if plain else ROBUST * full
+            if is_inertial_and_plain(f, graph, tree):
+                leaves = min(force, MOST_ERROR)
             if error > threshold:
                 mark_ends_pending(f, fac, var, node, pending, state)
     else:

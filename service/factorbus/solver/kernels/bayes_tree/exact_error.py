@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.hessian_room import copy_linear, jacobian_at, jacobian_size, kept_samples
-from factorbus.solver.kernels.bayes_tree.imu_error import exact_error_of_imu, is_plain_imu
+from factorbus.solver.kernels.bayes_tree.imu_error import exact_error_of_imu
 from factorbus.solver.kernels.bayes_tree.own_error import exact_error_of_own
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, part
@@ -33,7 +34,7 @@ def exact_error(f: int, graph: Graph, tree: Tree) -> tuple[float, float, float]:
     if is_one_of_many(f, graph.fac):
         if graph.fac[f, at.F_KIND] == at.OWN and jacobian_size(f, graph.var, graph.fac) != 0:
             return exact_error_of_own(f, graph, tree)
-        if is_plain_imu(f, graph.fac, graph.payload) and jacobian_size(f, graph.var, graph.fac) != 0:
+        if tree.factor_errors[f, tl.E_FORM] == tl.PLAIN_SAMPLES and jacobian_size(f, graph.var, graph.fac) != 0:
             return exact_error_of_imu(f, graph, tree)
         return exact_error_of_many(f, graph, tree)
     var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload

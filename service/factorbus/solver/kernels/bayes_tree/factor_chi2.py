@@ -11,7 +11,7 @@ import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.hessian_room import kept_samples
-from factorbus.solver.kernels.bayes_tree.imu_error import chi2_of_imu, is_plain_imu
+from factorbus.solver.kernels.bayes_tree.imu_error import chi2_of_imu
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.seen_in_space import between_se3_chi2, is_isotropic_in_space
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
@@ -80,7 +80,7 @@ def any_chi2(f: int, graph: Graph, tree: Tree) -> float:
     """By the kernel of the kind, with the loss of the factor."""
     var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
     if is_one_of_many(f, fac):
-        if is_plain_imu(f, fac, payload):
+        if tree.factor_errors[f, tl.E_FORM] == tl.PLAIN_SAMPLES:
             return chi2_of_imu(f, graph, tree)
         return chi2_of_many(f, var, fac, values, payload, kept_samples(f, var, fac, tree))
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))

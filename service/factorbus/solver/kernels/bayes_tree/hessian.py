@@ -8,6 +8,7 @@ from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weigh
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_isotropic
 from factorbus.solver.kernels.bayes_tree.hessian_of_many import write_hessian_rows
 from factorbus.solver.kernels.bayes_tree.hessian_room import hessian_size, keep_jacobian, kept_samples
+from factorbus.solver.kernels.bayes_tree.imu_error import is_plain_imu
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import Panel, put, six
@@ -214,3 +215,5 @@ def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
         factor_errors[f, tl.E_SHIFT] = shift_error_weight(root, distance, factor_errors[f, tl.E_TURN])
     factor_errors[f, tl.E_FORM] = tl.ISOTROPIC if is_isotropic(kind, fac[f, at.F_AT], payload) else 0.0
+    if is_plain_imu(f, fac, payload):
+        factor_errors[f, tl.E_FORM] = tl.PLAIN_SAMPLES

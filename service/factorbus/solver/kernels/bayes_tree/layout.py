@@ -30,13 +30,14 @@ N_RING = 13  # and the ring in which it did so; 0: the outermost; −1: it did n
 N_WIDTH = 16
 
 # Columns of `factor_errors`, a cache line of what every evaluation looks at: d, √ω, |Ω r| or what (9.13) is by shift
-# and |r|, the sum of ISOTROPIC and CORRECTED; at the estimate χ², error² in full, what a chord step leaves of it, and
+# and |r|, the form; at the estimate χ², error² in full, what a chord step leaves of it, and
 # error² as it counts.
 E_LEVER, E_ROOT, E_SHIFT, E_FORM, E_CHI2, E_ERROR, E_LEAVES, E_COUNTED = range(8)
 # And one of the rest: ω_θ; what (9.33) and (9.34) were where a chord step corrected the model, 6 numbers.
 E_TURN, E_MISSED, E_WIDTH = 8, 9, 16
-# In E_FORM: Ω of a translation is isotropic and not coupled to the angle; a chord step has corrected the linear model.
-ISOTROPIC, CORRECTED = 1.0, 2.0
+# In E_FORM: Ω of a translation is isotropic and not coupled to the angle; a chord step has corrected the linear model;
+# or, alone: it is of an IMU's samples, without a loss, and its Ω is one.
+ISOTROPIC, CORRECTED, PLAIN_SAMPLES = 1.0, 2.0, 4.0
 
 # Columns of `turns`.
 U_LEVER, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 4

@@ -21,6 +21,7 @@ from factorbus.solver.kernels.model.expression_layout import X_BEFORE, X_QUATERN
 from factorbus.solver.kernels.model.imu_expansion import write_expansion
 from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.imu_noise import write_root
+from factorbus.solver.kernels.model.imu_walk import walk_samples
 from factorbus.solver.kernels.model.kinds import direction_at, positive_at, quaternion_at
 from factorbus.solver.kernels.model.se2 import wrap
 from factorbus.solver.kernels.model.sizes import information_at, quaternion_of, scale_of, size_of
@@ -99,9 +100,10 @@ def check_imu(form: ImuLayout, p: int, payload: F64) -> int:
     for k in range(p + form.start, p + size, inertial.SAMPLE):
         if not payload[k] > 0.0:
             return gt.BAD_DURATION
-    if not write_root(form, payload[p:], size, payload[p:]):
+    walk = walk_samples(form, payload[p:])
+    if not write_root(payload[p:], walk, size, payload[p:]):
         return gt.BAD_NOISE
-    write_expansion(form, payload[p:])
+    write_expansion(form, payload[p:], walk)
     return gt.GOOD if are_within(MOST_LINEAR, p + size, inertial.ROOT, payload) else gt.BAD_NOISE
 
 

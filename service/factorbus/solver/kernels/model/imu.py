@@ -12,6 +12,7 @@ measurement.  Of what is integrated already it is (r_R, r_p, r_v, r_β).
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,8 +45,15 @@ _B, _FURTHER = 15, 30
 _T, _R, _V, _G = 0, 3, 6, 9
 # In the scratch behind the poses: Rₐ, Rₐᵀ R_b, Jr⁻¹(r_R), row by row, and a quaternion.
 _RA, _RAB, _SLOPE, _E = SCRATCH, SCRATCH + 9, SCRATCH + 18, SCRATCH + 27
-_SCRATCH = _E + 4
+IMU_SCRATCH = _E + 4
 _SMALL = 1e-4
+
+
+class Scratch(NamedTuple):
+    """Δ, see `make_room`, and room of IMU_SCRATCH numbers."""
+
+    room: F64
+    y: F64
 
 
 @part
@@ -65,13 +73,14 @@ def imu_plain(x: F64, places: I64, form: ImuLayout, z: F64, kept: F64, r: F64, J
     """The same without W."""
     bias, room = x[places[BIAS_A] : places[BIAS_A] + of.BIAS], kept if kept.size > 0 else make_room()
     put_delta(form, z, bias, room, True)
-    imu_of_delta(x, places, form, z, room, r, J)
+    imu_of_delta(x, places, form, z, Scratch(room, np.empty(IMU_SCRATCH)), r, J)
 
 
 @part
-def imu_of_delta(x: F64, places: I64, form: ImuLayout, z: F64, room: F64, r: F64, J: F64) -> None:
+def imu_of_delta(x: F64, places: I64, form: ImuLayout, z: F64, scratch: Scratch, r: F64, J: F64) -> None:
     """The same with Δ as it is in `room`."""
-    y, T = np.empty(_SCRATCH), room[ROOM_T]
+    room, y = scratch
+    T = room[ROOM_T]
     is_mounted = put_mount(form, x, places, z, y)
     put_sensor(is_mounted, False, x, places[POSE_A], y, FIRST)
     put_sensor(is_mounted, False, x, places[POSE_B], y, SECOND)

@@ -1,9 +1,12 @@
 """How certain what an IMU says is: the covariance of Δ, and what whitens by it.  MATH §3.10.
 
-Σ := F Σ Fᵀ + G Q Gᵀ,   the order (rotation, position, velocity)                                        (3.46)
+What sample n does to Δ, in the frame where the samples begin, with p and v behind it and t from there to the end:
 
-F = [ exp(ω h)ᵀ 0 0 ; −½ h² R ⌊α⌋  I  h I ; −h R ⌊α⌋  0  I ],
-G Q Gᵀ: of the gyroscopes σ_g² h Jr Jrᵀ, of the accelerometers σ_a² h (¼ h² I | ½ h I | I), of integration σ_i² h I
+    D = [ I ; −⌊c⌋ ; −⌊d⌋ ],   c = Δp − p − v t,   d = Δv − v,   Q = R Jr Jrᵀ Rᵀ = s I + κ u uᵀ
+    Σ = Σₙ σ_g² h D Q Dᵀ + σ_a² h [ 0 ; τ I ; I ] [ 0 ; τ I ; I ]ᵀ + σ_i² h [ 0 ; I ; 0 ] [ 0 ; I ; 0 ]ᵀ          (3.66)
+
+the order (rotation, position, velocity), u = R ω h, s = 2 (1 − cos θ)/θ², κ = (1 − s)/θ², τ = t + ½ h.  Then the
+rotation is turned to where the samples end.
 """
 
 import math
@@ -12,13 +15,23 @@ import numpy as np
 
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
-from factorbus.solver.kernels.model.imu_layout import ImuLayout
-from factorbus.solver.kernels.model.preintegration import (
-    SampleTerms,
-    add_sample,
-    nothing_yet,
-    scratch_of_sample,
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put
+from factorbus.solver.kernels.model.imu_walk import (
+    LANES,
+    T_B,
+    T_H,
+    T_LEFT,
+    T_P,
+    T_U,
+    T_V,
+    T_WIDTH,
+    P,
+    R,
+    V,
+    Walk,
 )
+from factorbus.solver.kernels.model.preintegration import SMALL_TURN
 
 SIZE = 9  # numbers of Δ
 # A pivot below this share of its diagonal entry is rounding: Σ is singular.
@@ -26,10 +39,10 @@ _PIVOT_TOLERANCE = 1e-14
 
 
 @part
-def write_root(form: ImuLayout, z: F64, k: int, out: F64) -> bool:
+def write_root(z: F64, walk: Walk, k: int, out: F64) -> bool:
     """W lower triangular, row by row, to out[k:], with WᵀW = Σ⁻¹ of the measurement that begins at z[0]; False: Σ is
     singular, as of a single sample without noise of integration."""
-    L = propagate_noise(form, z)
+    L = propagate_noise(z, walk)
     if not _factorize(L):
         return False
     # W = L⁻¹, column by column.
@@ -49,80 +62,139 @@ def write_root(form: ImuLayout, z: F64, k: int, out: F64) -> bool:
 
 
 @part
-def propagate_noise(form: ImuLayout, z: F64) -> F64:
-    """Σ (9, 9) of Δ, at the bias that the measurement names.  (3.46)"""
-    delta, sample, S = nothing_yet(), scratch_of_sample(), np.zeros((SIZE, SIZE))
-    M, bias = np.empty((4, 3, 3)), z[form.bias_at : form.bias_at + of.BIAS]
-    gyroscope, accelerometer, integration = z[of.GYROSCOPE], z[of.ACCELEROMETER], z[of.INTEGRATION]
-    for n in range(form.samples):
-        k = form.start + of.SAMPLE * n
-        add_sample(z, k, bias, delta, sample, True)
-        h, Jr = z[k], sample.Jr
-        _carry(h, sample, S, M)
-        turned, pushed = gyroscope * gyroscope * h, accelerometer * accelerometer * h
-        for a in range(3):
-            for c in range(a + 1):
-                S[a, c] += turned * (Jr[a, 0] * Jr[c, 0] + Jr[a, 1] * Jr[c, 1] + Jr[a, 2] * Jr[c, 2])
-            S[3 + a, 3 + a] += 0.25 * h * h * pushed + integration * integration * h
-            S[6 + a, 3 + a] += 0.5 * h * pushed
-            S[6 + a, 6 + a] += pushed
+def propagate_noise(z: F64, walk: Walk) -> F64:
+    """Σ (9, 9) of Δ, at the bias that the measurement names.  (3.46), as (3.66) has it"""
+    S, trace, w = np.zeros(SIZE * SIZE), walk.trace, walk.lanes
+    p = w[P * LANES], w[(P + 1) * LANES], w[(P + 2) * LANES]
+    v = w[V * LANES], w[(V + 1) * LANES], w[(V + 2) * LANES]
+    plain = drifts = spreads = steps = 0.0  # Σ s h, and what accelerometers and integration add
+    for k in range(0, trace.size, T_WIDTH):
+        left, h = load(trace, k + T_LEFT), load(trace, k + T_H)
+        reach = left + 0.5 * h
+        steps, drifts, spreads = steps + h, drifts + h * reach, spreads + h * reach * reach
+        d = _less(v, trace, k + T_V, 1.0, (0.0, 0.0, 0.0))
+        c = _less(p, trace, k + T_V, left, _three(trace, k + T_P))
+        u = _three(trace, k + T_U)
+        share, square = 2.0 * load(trace, k + T_B), u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+        # 1 − s is as small as θ² is.
+        if square < SMALL_TURN:
+            bent = 1 / 12 - square * (1 / 360 - square * (1 / 20160 - square * (1 / 1814400 - square / 239500800)))
+        else:
+            bent = (1.0 - share) / square
+        plain += share * h
+        _add_sample(share * h, bent * h, c, d, u, S)
+    out, turned = np.zeros((SIZE, SIZE)), z[of.GYROSCOPE] * z[of.GYROSCOPE]
+    _turn_to_end(S, plain, turned, w, out)
+    pushed, integration = z[of.ACCELEROMETER] * z[of.ACCELEROMETER], z[of.INTEGRATION] * z[of.INTEGRATION]
+    for a in range(3):
+        out[3 + a, 3 + a] += pushed * spreads + integration * steps
+        out[6 + a, 3 + a] += pushed * drifts
+        out[6 + a, 6 + a] += pushed * steps
     for a in range(SIZE):
         for c in range(a):
-            S[c, a] = S[a, c]
-    return S
+            out[c, a] = out[a, c]
+    return out
 
 
 @inline_kernel
-def _carry(h: float, sample: SampleTerms, S: F64, M: F64) -> None:
-    """Σ := F Σ Fᵀ, of which the lower triangle is kept, but whole blocks off the diagonal.
+def _three(a: F64, k: int) -> tuple:
+    return load(a, k), load(a, k + 1), load(a, k + 2)
 
-    With α = A r and A = −h R ⌊α⌋: v += α, p += h v + ½ h α with the v of before, then r := exp(ω h)ᵀ r.
-    M (4, 3, 3): covariances of α with r, p and v, and of itself.
-    """
-    RA, E, ar, ap, av, aa = sample.RA, sample.E, M[0], M[1], M[2], M[3]
+
+@inline_kernel
+def _less(x: tuple, a: F64, k: int, scale: float, y: tuple) -> tuple:
+    """x − y − scale a[k : k+3]."""
+    return (
+        x[0] - y[0] - scale * load(a, k),
+        x[1] - y[1] - scale * load(a, k + 1),
+        x[2] - y[2] - scale * load(a, k + 2),
+    )
+
+
+@inline_kernel
+def _cross(x: tuple, y: tuple) -> tuple:
+    return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
+
+
+@inline_kernel
+def _add_sample(plain: float, bent: float, c: tuple, d: tuple, u: tuple, S: F64) -> None:
+    """S += D (s I + κ u uᵀ) Dᵀ on and below the diagonal, but for s I of the rotation; plain = s h, bent = κ h."""
+    e, f = _cross(u, c), _cross(u, d)
+    bu, be, bf = _times(bent, u), _times(bent, e), _times(bent, f)
+    pc, pd = _times(plain, c), _times(plain, d)
+    cc, cd, dd = _dot(pc, c), _dot(pc, d), _dot(pd, d)
+    _add(S, 0, bu[0] * u[0])
+    _add(S, 9, bu[1] * u[0])
+    _add(S, 10, bu[1] * u[1])
+    _add(S, 18, bu[2] * u[0])
+    _add(S, 19, bu[2] * u[1])
+    _add(S, 20, bu[2] * u[2])
+    _add_row(S, 27, be[0], u, (0.0, pc[2], -pc[1]))
+    _add_row(S, 36, be[1], u, (-pc[2], 0.0, pc[0]))
+    _add_row(S, 45, be[2], u, (pc[1], -pc[0], 0.0))
+    _add_row(S, 54, bf[0], u, (0.0, pd[2], -pd[1]))
+    _add_row(S, 63, bf[1], u, (-pd[2], 0.0, pd[0]))
+    _add_row(S, 72, bf[2], u, (pd[1], -pd[0], 0.0))
+    _add(S, 30, be[0] * e[0] + cc - pc[0] * c[0])
+    _add(S, 39, be[1] * e[0] - pc[1] * c[0])
+    _add(S, 40, be[1] * e[1] + cc - pc[1] * c[1])
+    _add(S, 48, be[2] * e[0] - pc[2] * c[0])
+    _add(S, 49, be[2] * e[1] - pc[2] * c[1])
+    _add(S, 50, be[2] * e[2] + cc - pc[2] * c[2])
+    _add_row(S, 57, bf[0], e, (cd - pc[0] * d[0], -pc[0] * d[1], -pc[0] * d[2]))
+    _add_row(S, 66, bf[1], e, (-pc[1] * d[0], cd - pc[1] * d[1], -pc[1] * d[2]))
+    _add_row(S, 75, bf[2], e, (-pc[2] * d[0], -pc[2] * d[1], cd - pc[2] * d[2]))
+    _add(S, 60, bf[0] * f[0] + dd - pd[0] * d[0])
+    _add(S, 69, bf[1] * f[0] - pd[1] * d[0])
+    _add(S, 70, bf[1] * f[1] + dd - pd[1] * d[1])
+    _add(S, 78, bf[2] * f[0] - pd[2] * d[0])
+    _add(S, 79, bf[2] * f[1] - pd[2] * d[1])
+    _add(S, 80, bf[2] * f[2] + dd - pd[2] * d[2])
+
+
+@inline_kernel
+def _times(x: float, y: tuple) -> tuple:
+    return x * y[0], x * y[1], x * y[2]
+
+
+@inline_kernel
+def _dot(x: tuple, y: tuple) -> float:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+@inline_kernel
+def _add(S: F64, k: int, x: float) -> None:
+    put(S, k, load(S, k) + x)
+
+
+@inline_kernel
+def _add_row(S: F64, k: int, x: float, y: tuple, more: tuple) -> None:
+    """S[k : k+3] += x y + more."""
+    _add(S, k, x * y[0] + more[0])
+    _add(S, k + 1, x * y[1] + more[1])
+    _add(S, k + 2, x * y[2] + more[2])
+
+
+@inline_kernel
+def _turn_to_end(S: F64, plain: float, scale: float, w: F64, out: F64) -> None:
+    """The sum times `scale`, with the rotation as seen where the samples end: its rows and columns times R."""
+    for a in range(SIZE):
+        for c in range(a + 1):
+            out[a, c] = scale * S[SIZE * a + c]
     for a in range(3):
+        out[a, a] += scale * plain
         for c in range(a):
-            S[c, a], S[3 + c, 3 + a], S[6 + c, 6 + a] = S[a, c], S[3 + a, 3 + c], S[6 + a, 6 + c]
-    for a in range(3):
-        A0, A1, A2 = -h * RA[a, 0], -h * RA[a, 1], -h * RA[a, 2]
+            out[c, a] = out[a, c]
+    for a in range(SIZE):
+        s0, s1, s2 = out[a, 0], out[a, 1], out[a, 2]
         for c in range(3):
-            ar[a, c] = A0 * S[0, c] + A1 * S[1, c] + A2 * S[2, c]
-            ap[a, c] = A0 * S[3 + c, 0] + A1 * S[3 + c, 1] + A2 * S[3 + c, 2]
-            av[a, c] = A0 * S[6 + c, 0] + A1 * S[6 + c, 1] + A2 * S[6 + c, 2]
-    for a in range(3):
-        for c in range(3):
-            aa[a, c] = -h * (ar[a, 0] * RA[c, 0] + ar[a, 1] * RA[c, 1] + ar[a, 2] * RA[c, 2])
-    for a in range(3):
-        for c in range(a + 1):
-            vp, pv = S[6 + a, 3 + c] + 0.5 * ap[a, c], S[6 + c, 3 + a] + 0.5 * ap[c, a]
-            ww = S[6 + a, 6 + c] + 0.5 * (av[a, c] + av[c, a]) + 0.25 * aa[a, c]
-            S[3 + a, 3 + c] += h * (vp + pv + h * ww)
-    for a in range(3):
-        for c in range(3):
-            vv = S[6 + a, 6 + c] + av[a, c] + 0.5 * (av[c, a] + aa[a, c])
-            S[6 + a, 3 + c] += ap[a, c] + h * vv
-            S[3 + a, c] += h * (S[6 + a, c] + 0.5 * ar[a, c])
-    for a in range(3):
-        for c in range(3):
-            S[6 + a, c] += ar[a, c]
-        for c in range(a + 1):
-            S[6 + a, 6 + c] += av[a, c] + av[c, a] + aa[a, c]
-    _turn_columns(3, E, S)
-    _turn_columns(6, E, S)
-    _turn_columns(0, E, S)
+            k = (R + c) * LANES
+            out[a, c] = s0 * w[k] + s1 * w[k + 3 * LANES] + s2 * w[k + 6 * LANES]
     for c in range(3):
-        s0, s1, s2 = S[0, c], S[1, c], S[2, c]
+        s0, s1, s2 = out[0, c], out[1, c], out[2, c]
         for a in range(3):
-            S[a, c] = E[0, a] * s0 + E[1, a] * s1 + E[2, a] * s2
-
-
-@inline_kernel
-def _turn_columns(row: int, E: F64, S: F64) -> None:
-    """The block of a row with the rotation, times E."""
-    for a in range(row, row + 3):
-        s0, s1, s2 = S[a, 0], S[a, 1], S[a, 2]
-        for c in range(3):
-            S[a, c] = s0 * E[0, c] + s1 * E[1, c] + s2 * E[2, c]
+            k = (R + a) * LANES
+            out[a, c] = w[k] * s0 + w[k + 3 * LANES] * s1 + w[k + 6 * LANES] * s2
 
 
 @inline_kernel

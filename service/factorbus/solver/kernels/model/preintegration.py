@@ -18,7 +18,7 @@ from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix
 
-_SMALL = (
+SMALL_TURN = (
     0.04  # radians²: below, the terms of the series are exact to rounding, and take half the time of sine and cosine
 )
 
@@ -192,7 +192,7 @@ def fill_rotation(q: F64, k: int, R: F64) -> None:
 @inline_kernel
 def half_turn(square: float) -> tuple:
     """(sin(θ/2)/θ, cos(θ/2)) of θ²: the quaternion of a rotation vector φ is (sin(θ/2)/θ φ, cos(θ/2))."""
-    if square >= _SMALL:
+    if square >= SMALL_TURN:
         angle = math.sqrt(square)
         return math.sin(0.5 * angle) / angle, math.cos(0.5 * angle)
     s = 0.25 * square
@@ -219,14 +219,19 @@ def _describe(ax: float, ay: float, az: float, x: float, y: float, z: float, sam
 @inline_kernel
 def series_of(q: float) -> tuple:
     """(sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³) of θ²."""
-    if q < _SMALL:
-        a = 1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q * (1 / 39916800)))))
-        b = 0.5 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q * (1 / 479001600)))))
-        c = 1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q * (1 / 39916800))))
-    else:
-        angle = math.sqrt(q)
-        a, sine = math.sin(angle) / angle, math.sin(0.5 * angle)
-        b, c = 2.0 * sine * sine / q, (1.0 - a) / q
+    if q < SMALL_TURN:
+        return few_terms_of(q)
+    angle = math.sqrt(q)
+    a, sine = math.sin(angle) / angle, math.sin(0.5 * angle)
+    return a, 2.0 * sine * sine / q, (1.0 - a) / q
+
+
+@inline_kernel
+def few_terms_of(q: float) -> tuple:
+    """The same where θ² is less than SMALL_TURN."""
+    a = 1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q * (1 / 39916800)))))
+    b = 0.5 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q * (1 / 479001600)))))
+    c = 1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q * (1 / 39916800))))
     return a, b, c
 
 
