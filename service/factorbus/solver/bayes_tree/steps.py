@@ -338,7 +338,7 @@ class TreeSteps:
         self, started: float, compiled: float, result: Minimization | None, because: str, budget: float, clear: bool
     ) -> StepReport:
         """clear: the step has converged, as its status says."""
-        before, self._mark = self._mark, self._graph.mark()
+        before, self._mark, self._graph.own_before = self._mark, self._graph.mark(), None
         now, clock, tree = self._mark, self._options.clock, self._tree
         self._first_new, self._batched = before[at.VARIABLES], result is not None
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = tree.state[_COUNTS].tolist()
