@@ -119,3 +119,13 @@ def test_where_damped_steps_hardly_gain_the_next_ones_begin_without_damping(monk
     for _ in range(5):
         solver.step()
     assert tried == [0.0, 100.0, 0.0, 100.0, 0.0]
+
+
+def test_a_step_with_nothing_new_does_not_rest_beside_a_saddle_point() -> None:
+    """Σ error² is 10⁻⁹ of χ² there, and 4 · 10⁻⁷ is what a step takes off."""
+    solver = Solver(AS_GIVEN)
+    assert put(solver, between_two(1e-8)).chi2 == pytest.approx(200.0)
+    report = solver.step()
+    assert report.chi2 == pytest.approx(BEST, rel=1e-2)
+    assert report.converged
+    assert not solver.unfinished

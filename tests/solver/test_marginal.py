@@ -12,6 +12,8 @@ from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.graph.whitened import whitened
+from factorbus.solver.sparse.full_rank import LEAST_EIGENVALUE
 
 SPACES = {"se2": (3, 3), "se3": (7, 6)}
 
@@ -229,3 +231,30 @@ def test_no_marginal_leads_away_from_the_optimum(prior: float) -> None:
 def test_a_marginal_that_cannot_hold_the_map_is_named() -> None:
     with pytest.raises(errors.Underconstrained, match="marginalized may have been all that says where the map is"):
         with_changes(weakly_held(1e5), Changes().marginalize("x0", "x1", "x2").listed())
+
+
+def triangle(prior: float) -> Solver:
+    """Three poses that links of σ 1e-5 join, and a prior of this σ on the first."""
+    solver, stiff = Solver(), [1e-5] * 3
+    draft = Draft().se2("x0", (0, 0, 0)).prior_se2("x0", (0, 0, 0), sigmas=[prior] * 3)
+    draft.se2("x1", (1, 0, 0)).se2("x2", (1, 1, 0))
+    for a, b, z in (("x0", "x1", (1, 0, 0)), ("x1", "x2", (0, 1, 0)), ("x0", "x2", (1, 1, 0))):
+        draft.between_se2(a, b, z, sigmas=stiff)
+    put(solver, draft)
+    return solver
+
+
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("prior", [7.0, 9.0])
+def test_what_a_dense_solve_has_digits_for_is_taken(prior: float, mode: str) -> None:
+    """By Λ, which has the squares of what is known, more was asked for."""
+    solver = triangle(prior)
+    graph, batch = graph_in(solver), Solver(Options(mode=mode))
+    J = whitened(graph, range(4), [graph.find(symbol("x", n)) for n in range(3)]).J
+    R = np.linalg.qr(J, mode="r")[3:, 3:]
+    assert np.linalg.svd(R / np.sqrt((R * R).sum(0)), compute_uv=False)[-1] ** 2 >= LEAST_EIGENVALUE
+    made, *_ = with_changes(solver, Changes().marginalize("x0").listed())
+    for key in (symbol("x", 1), symbol("x", 2)):
+        assert distance("se2", values(made)[key][1], values(solver)[key][1]) < 1e-6
+    batch.stage(Batch(*(tuple(groups) for groups in made.graph())))
+    assert batch.step().chi2 == pytest.approx(made.chi2(), abs=1e-9)

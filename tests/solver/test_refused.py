@@ -4,15 +4,18 @@ are those of a map that it never came to."""
 from collections.abc import Callable
 from itertools import islice
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from naive.random_graphs import camera_steps, random_steps
 from naive.states import flattened
+from tested_maps import TestedMap, between, corridor
 
 from examples import examples
 from factorbus.client import Draft
-from factorbus.proto.messages import Batch
+from factorbus.client.expressions import SE2, Point2, Vector, factor, norm
+from factorbus.proto.messages import Batch, Variables
 from factorbus.solver import Options, Solver, errors
 
 MODES = ["bayes-tree", "inc-l", "inc-l-b10", "all-batch"]
@@ -38,6 +41,16 @@ def many_free() -> Draft:
 
 def one_range() -> Draft:
     return Draft().point2("r0", (3, 4)).range_se2(HERE, "r0", 5.0, sigmas=0.1)
+
+
+@factor
+def range_of_ours(a: SE2, l: Point2, z: Vector[1]):
+    return norm(a.position - l) - z
+
+
+def one_range_of_an_own_kind() -> Draft:
+    """The kind is the map's only once it has a factor of it."""
+    return Draft().point2("r0", (3, 4)).factor(range_of_ours, (HERE, "r0"), [5.0], sigmas=0.1)
 
 
 def held_in_two_of_three() -> Draft:
@@ -77,6 +90,7 @@ REFUSED: dict[Callable[[], Draft], type[errors.SolverError]] = {
     free_pair: errors.Underconstrained,
     many_free: errors.Underconstrained,
     one_range: errors.Underconstrained,
+    one_range_of_an_own_kind: errors.Underconstrained,
     held_in_two_of_three: errors.Underconstrained,
     held_with_one_that_is_not: errors.Underconstrained,
     there_already: errors.DuplicateVariable,
@@ -142,3 +156,25 @@ def test_a_map_goes_on_as_if_nothing_had_been_refused(
             assert flattened(tried.dump()) == before
         assert tell(tried, batch) == tell(spared, batch)
     assert told_of(tried) == told_of(spared)
+
+
+AHEAD = [1.0, 0.0, 0.0]
+UNHELD = {
+    "an end that is not there": Batch(factors=(between(2, 99, AHEAD),)),
+    "a pair that nothing holds": Batch(
+        (Variables("se2", np.array([50, 60]), np.zeros((2, 3))),), (between(50, 60, AHEAD),)
+    ),
+    "a fixed pose, and an end that is not there": Batch(
+        (Variables("se2", np.array([70]), np.zeros((1, 3)), True),), (between(70, 99, AHEAD),)
+    ),
+}
+
+
+@pytest.mark.parametrize("content", UNHELD.values(), ids=UNHELD)
+def test_nor_does_it_in_what_hangs_together_where_closures_are_tested(content: Batch) -> None:
+    made = TestedMap()
+    for batch in corridor(4):
+        made.insert(batch)
+    before = flattened(made.solver.dump())
+    assert isinstance(made.insert(content)[0], errors.SolverError)
+    assert flattened(made.solver.dump()) == before

@@ -5,6 +5,7 @@ import pytest
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Solver, errors
+from factorbus.solver.sparse.full_rank import least_eigenvalue
 
 I2, I3 = np.array([[1.0, 0, 1]]), np.array([[1.0, 0, 0, 1, 0, 1]])
 I6 = np.eye(6)[np.triu_indices(6)][None]
@@ -111,3 +112,22 @@ def test_only_fixed_variables_make_a_map_with_nothing_to_solve() -> None:
     report = solver.step(settle=True)
     assert (report.strategy, report.chi2) == ("extend", 1.0)
     assert Solver().step().chi2 == 0.0
+
+
+@pytest.mark.parametrize("least", [1e-2, 1e-12, 1e-14, 1e-18])
+def test_the_least_eigenvalue_is_that_of_singular_values(least: float) -> None:
+    """Of JᵀJ in doubles what is below some 1e-15 is rounding."""
+    rng, m, n = np.random.default_rng(4), 45, 30
+    U, V = (np.linalg.qr(rng.normal(size=(rows, n)))[0] for rows in (m, n))
+    J = U * np.sqrt([*rng.uniform(0.1, 1.0, n - 1), least]) @ V.T
+    wanted = np.linalg.svd(J / np.sqrt((J * J).sum(0)), compute_uv=False)[-1] ** 2
+    rows, columns = np.indices((m, n))
+    found = least_eigenvalue(J.reshape(-1), rows.reshape(-1), columns.reshape(-1), (m, n))
+    assert found == pytest.approx(wanted, rel=0.2 if least == 1e-2 else 1e-2)
+
+
+def test_what_has_no_rank_has_no_eigenvalue_to_speak_of() -> None:
+    J = np.random.default_rng(4).normal(size=(45, 30))
+    J[:, 7] = J[:, 3] - 2.0 * J[:, 20]
+    rows, columns = np.indices(J.shape)
+    assert least_eigenvalue(J.reshape(-1), rows.reshape(-1), columns.reshape(-1), J.shape) < 1e-25

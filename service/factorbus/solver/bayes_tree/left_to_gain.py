@@ -1,6 +1,7 @@
 """What is left to gain after a step of the tree, where Σ error² does not say it.  MATH §9.6
 
-Σ error² takes it that the linear problem is solved, and takes the force of each factor by itself.
+Σ error² takes the force of each factor by itself; what it says nothing of where the linear problem is not solved, see
+`kernels/bayes_tree/convergence.py`.
 """
 
 import math
@@ -14,14 +15,6 @@ from factorbus.solver.optimize.gauss_newton import Minimization
 # By what share of χ² a step of Levenberg-Marquardt may lower it that is the last one, where pivots were raised.
 AT_END = 1e-7
 _ROUNDING = 1e-12
-
-
-def unsolved(tree: CliqueTree) -> float:
-    """What of the linear problem is not solved: where something was left behind, and where the estimate was put back to
-    the linearization points, from where cliques are solved again only below what moves."""
-    if not (tree.behind or math.isinf(tree.totals.item(tl.T_LEFT))):
-        return 0.0
-    return max(tree.totals.item(tl.T_CHI2) - tree.totals.item(tl.T_MODEL), 0.0)
 
 
 def is_left(tree: CliqueTree, share: float) -> bool:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.bayes_tree.left_to_gain import AT_END, is_left, judge_batch, unsolved
+from factorbus.solver.bayes_tree.left_to_gain import AT_END, is_left, judge_batch
 from factorbus.solver.bayes_tree.reasons import why_batch, why_tree
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.bayes_tree.undetermined import check_determined
@@ -19,7 +19,7 @@ from factorbus.solver.graph.escaped import find_beyond
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.convergence import FINISHED
+from factorbus.solver.kernels.bayes_tree.convergence import FINISHED, unsolved
 from factorbus.solver.kernels.bayes_tree.defer import MOST_RISE
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -230,6 +230,9 @@ class TreeSteps:
             asks = only_raised and not tree.behind and error <= allowed and not self._is_within(share, chi2)
         if asks:
             is_left(tree, share)
+        elif tree.state.item(tl.S_CONTINUES) and not self.unfinished:
+            # Before what is left alone rests: Σ error² takes each force by itself.
+            is_left(tree, AT_END)
 
     def _complete(self, settle: bool, because: str, escaped: bool, bounded: bool) -> tuple[Minimization | None, str]:
         """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
@@ -335,7 +338,7 @@ class TreeSteps:
         self, started: float, compiled: float, result: Minimization | None, because: str, budget: float, clear: bool
     ) -> StepReport:
         """clear: the step has converged, as its status says."""
-        before, self._mark = self._mark, self._graph.mark()
+        before, self._mark, self._graph.own_before = self._mark, self._graph.mark(), None
         now, clock, tree = self._mark, self._options.clock, self._tree
         self._first_new, self._batched = before[at.VARIABLES], result is not None
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = tree.state[_COUNTS].tolist()
@@ -372,7 +375,7 @@ class TreeSteps:
         if (
             totals.item(tl.T_ERROR) + totals.item(tl.T_EXCESS) <= totals.item(tl.T_ALLOWED)
             and not (tree.behind or tree.slow)
-            and unsolved(tree) <= share * (chi2 + LEAST_CHI2)
+            and unsolved(tree.state, totals) <= share * (chi2 + LEAST_CHI2)
             and (not tree.raised or self._is_within(share, chi2))
         ):
             return True
@@ -383,6 +386,6 @@ class TreeSteps:
         totals = self._tree.totals
         chi2, error, least = (totals.item(k) for k in (tl.T_CHI2, tl.T_ERROR, tl.T_LEAST))
         error += totals.item(tl.T_EXCESS)
-        most = min(error + unsolved(self._tree), max(chi2, 0.0) - least)
+        most = min(error + unsolved(self._tree.state, totals), max(chi2, 0.0) - least)
         left = 0.0 if result and result.converged else most
         return self._tree.deferred, left, totals.item(tl.T_WORK), budget, self.complete

@@ -109,6 +109,7 @@ class TrustedForest:
         self._above: dict[object, object] = {}
         self._sizes: dict[object, int] = {}  # of roots; one that is not here has 1
         self._linked: list[tuple[object, object]] = []  # by the last batch
+        self._alone: list[object] = []  # what came with it and hung on nothing then
         self._newest: tuple[object, object] = (None, None)  # the end of a chain, and its root; of none after a merger
 
     def split(self, batch: BatchLike) -> SplitFactors:
@@ -117,7 +118,7 @@ class TrustedForest:
         Where none does, as in most batches, `NOTHING_CLOSES`, which does not say what is trusted: all is.
         """
         above, sizes, linked, (newest, root) = self._above, self._sizes, self._linked, self._newest
-        linked.clear()
+        self._begin()
         for group in batch.variables:
             if group.fixed:
                 self._ground(group.keys)
@@ -162,7 +163,7 @@ class TrustedForest:
 
     def join(self, batch: BatchLike) -> None:
         """Join what all factors of a batch join."""
-        self._linked.clear()
+        self._begin()
         for group in batch.variables:
             if group.fixed:
                 self._ground(group.keys)
@@ -172,9 +173,14 @@ class TrustedForest:
     def forget(self) -> None:
         """As before the last batch, which was refused."""
         for under, over in reversed(self._linked):
-            self._above[under] = under
-            self._sizes[over] -= self._sizes.setdefault(under, 1)
-        self._linked.clear()
+            self._sizes[over] -= self._sizes.get(under, 1)
+            if under in self._sizes:
+                self._above[under] = under
+            else:
+                del self._above[under]
+        for key in self._alone:
+            del self._above[key], self._sizes[key]
+        self._begin()
         self._newest = (None, None)
 
     def renew(self, graph: FactorGraph) -> None:
@@ -193,7 +199,7 @@ class TrustedForest:
             first, *others = graph.ends_of(row)
             for v in others:
                 self._join(keys[first], keys[v])
-        self._linked.clear()
+        self._begin()
 
     def dump(self) -> dict[str, Any]:
         """Which keys hang together: of each the number of its part; ground: that of what is fixed, or −1."""
@@ -209,7 +215,12 @@ class TrustedForest:
         heads: dict[int, object] = {} if state["ground"] < 0 else {int(state["ground"]): _GROUND}
         for key, part in zip(np.asarray(state["keys"]).tolist(), np.asarray(state["parts"]).tolist(), strict=True):
             self._join(heads.setdefault(part, key), key)
+        self._begin()
+
+    def _begin(self) -> None:
+        """What is joined from here on is of one batch."""
         self._linked.clear()
+        self._alone.clear()
 
     def _ground(self, keys: I64) -> None:
         for key in keys.tolist():
@@ -242,6 +253,7 @@ class TrustedForest:
     def _root(self, of: object) -> object:
         if of not in self._above:
             self._above[of], self._sizes[of] = of, 1
+            self._alone.append(of)
         while (higher := self._above[of]) != of:
             of = higher
         return of

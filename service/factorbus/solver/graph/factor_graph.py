@@ -61,7 +61,7 @@ class FactorGraph(Arenas):
 
     ARENAS = records.Graph._fields
     # Of a solver's state: they follow from the rest.
-    NOT_KEPT = ("_rows", "_id_room", "_unlisted", "array_table", "own_code")
+    NOT_KEPT = ("_rows", "_id_room", "_unlisted", "array_table", "own_before", "own_code")
 
     def __init__(self) -> None:
         # Room for the first few hundred factors: the step that finds none takes several times as long.
@@ -82,6 +82,8 @@ class FactorGraph(Arenas):
         self._unlisted: tuple[I64, int] | None = None  # both as they were before factors had several rows
         self.holes = 0  # numbers of the payload that no factor has any more
         self.own: tuple[str, ...] = ()  # the own kinds of its factors: their formulas, each once
+        # Where kinds came since the last step: how many rows of factors there were, and the kinds.
+        self.own_before: tuple[int, tuple[str, ...]] | None = None
         self._rows = Rows()
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -108,6 +110,8 @@ class FactorGraph(Arenas):
             remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
         self.dims[mark[at.COLUMNS] : self.counts[at.COLUMNS]] = 0
         self.counts[:] = mark
+        if self.own_before is not None and mark[at.FACTORS] <= self.own_before[0]:
+            self.own, self.own_before = self.own_before[1], None
         self.forget_ids()
         if self._rows.forget(mark[at.VARIABLES]):
             # Somebody may have an estimate of what is gone, its keys and stamps.

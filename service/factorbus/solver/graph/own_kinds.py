@@ -44,6 +44,8 @@ def take_own_kinds(graph: FactorGraph, batch: BatchLike) -> None:
         raise errors.TooLarge("the map with this", len(with_new), MOST_OWN, "own kinds", _FEWER)
     if (results := _results(with_new)) > MOST_RESULTS_OF_MAP:
         raise errors.TooLarge("the map with this", results, MOST_RESULTS_OF_MAP, _RESULTS, _FEWER)
+    if graph.own_before is None:
+        graph.own_before = int(graph.counts[at.FACTORS]), graph.own
     graph.own = tuple(with_new)
 
 

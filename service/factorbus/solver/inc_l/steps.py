@@ -308,6 +308,7 @@ class IncrementalSteps:
         if solved:
             unsolved = 0.0 if result.converged or result.linear else np.inf
         blocks, numbers = self._system.blocks.fill.tolist()
+        self._graph.own_before = None
         self._done = _Done(
             self._graph.mark(),
             (blocks, numbers),

@@ -15,7 +15,7 @@ from factorbus.solver.kernels.sparse.partial_cholesky import ROUNDING
 from factorbus.solver.optimize.conjugate import ConjugateGradients
 from factorbus.solver.optimize.factor import Factor
 from factorbus.solver.report import Stopwatch
-from factorbus.solver.sparse.anchors import LOOSE, find_loose, find_loose_by_themselves
+from factorbus.solver.sparse.anchors import find_loose, find_loose_by_themselves
 from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.full_rank import have_full_rank
 
@@ -218,7 +218,7 @@ class System(Generic[R]):
             loose, suspects = find_loose_by_themselves(self.graph, self.blocks, suspects)
         if loose < 0 and suspects.size:
             loose = find_loose(self.graph, self.blocks, suspects, self._solve)
-        if loose >= 0 and not have_full_rank(self.graph, self._suspects, LOOSE):
+        if loose >= 0 and not have_full_rank(self.graph, self._suspects):
             raise self.underconstrained(loose)
 
     def _may_have_found(self) -> bool:

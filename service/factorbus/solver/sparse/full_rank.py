@@ -1,7 +1,7 @@
-"""Do factors determine variables, whatever the factors weigh?  Asked before variables are refused.  MATH §7.
+"""Do factors determine variables?  Asked before variables are refused for their numbers.  MATH §7.
 
-Λ = JᵀΩJ is positive definite where Ω is and J has full column rank: how much a row of J weighs does not matter to that,
-only to Λ in doubles.
+Λ = JᵀΩJ has lost the digits that tell where factors weigh very differently, and Ω^½ J has not.  And Λ is positive
+definite where Ω is and J has full column rank: how much a row of J weighs does not matter to that.
 """
 
 import numpy as np
@@ -15,19 +15,22 @@ from factorbus.solver.kernels.model import layout as at
 # Of the longest row of a factor, what may be rounding: Jacobians of a map that lies some thousand kilometres from its
 # origin are 10⁻⁹ off.
 _NOTHING = 1e-8
+# The least eigenvalue of JᵀJ, columns of J scaled to length 1, with which a dense solve has a digit or two left.
+LEAST_EIGENVALUE = 1e-13
+# One of no more is nothing but rounding, whatever the rows weigh.
+_SINGULAR = 1e-25
+# Of r beside x in (7.2): near the least singular value that is asked about.
+_ALPHA = 1e-6
+_ROUNDS = 4
 
 
-def have_full_rank(graph: FactorGraph, variables: I64, loosest: float) -> bool:
-    """Whether the factors on these free variables determine them, all others held: (7.1) of JᵀJ, rows of J scaled to
-    length 1, then columns, is at most `loosest`, of a normal vector in place of signs: a row with two equal entries
-    hides from signs."""
-    from scipy.sparse import coo_array, csc_array, diags_array
-    from scipy.sparse.linalg import splu
-
+def have_full_rank(graph: FactorGraph, variables: I64) -> bool:
+    """Whether the factors on these free variables determine them, all others held: with rows of J scaled to length 1,
+    or as they weigh."""
     dims = graph.dims[graph.var[variables, at.V_COLUMN]]
     start, n = np.full(int(graph.counts[at.VARIABLES]), -1), int(dims.sum())
     start[variables] = np.cumsum(dims) - dims
-    rows, columns, numbers, m = list[I64](), list[I64](), list[F64](), 0
+    rows, columns, weighted, scaled, m = list[I64](), list[I64](), list[F64](), list[F64](), 0
     for first_row in _factors_on(graph, start >= 0):
         factor = linearized_factor(graph, first_row)
         place = np.concatenate(
@@ -37,18 +40,46 @@ def have_full_rank(graph: FactorGraph, variables: I64, loosest: float) -> bool:
         J = _scaled(factor, place >= 0, is_linear)
         rows.append(m + np.repeat(np.arange(len(J)), J.shape[1]))
         columns.append(np.tile(place[place >= 0], len(J)))
-        numbers.append(J.reshape(-1))
+        weighted.append((np.linalg.cholesky(factor.W).T @ factor.J[:, place >= 0]).reshape(-1))
+        scaled.append(J.reshape(-1))
         m += len(J)
-    J = coo_array((np.concatenate(numbers), (np.concatenate(rows), np.concatenate(columns))), shape=(m, n)).tocsc()
+    if m < n:
+        return False
+    places = np.concatenate(rows), np.concatenate(columns)
+    found = least_eigenvalue(np.concatenate(scaled), *places, (m, n))
+    if _SINGULAR < found < LEAST_EIGENVALUE:
+        found = least_eigenvalue(np.concatenate(weighted), *places, (m, n))
+    return found >= LEAST_EIGENVALUE
+
+
+def least_eigenvalue(numbers: F64, rows: I64, columns: I64, shape: tuple[int, int]) -> float:
+    """The least eigenvalue of JᵀJ, columns of J (m, n) scaled to length 1, by inverse iteration; 0: it is singular.
+
+    JᵀJ x = −α b by (7.2), whose condition number is that of J, not its square:
+
+        [ α I  J ] [ r ]   [ 0 ]
+        [ Jᵀ     ] [ x ] = [ b ]
+    """
+    from scipy.sparse import block_array, coo_array, csc_array, diags_array, eye_array
+    from scipy.sparse.linalg import splu
+
+    m, n = shape
+    J = coo_array((numbers, (rows, columns)), shape=shape).tocsc()
     length = np.sqrt(np.asarray((J * J).sum(0)))
     if not length.all():
-        return False
+        return 0.0
     J = J @ diags_array(1.0 / length)
     try:
-        answer = splu(csc_array(J.T @ J)).solve(np.random.default_rng(1).normal(size=n))
+        solve = splu(csc_array(block_array([[_ALPHA * eye_array(m), J], [J.T, None]]))).solve
     except RuntimeError:  # a pivot is zero
-        return False
-    return bool(np.isfinite(answer).all() and np.abs(answer).max() <= loosest)
+        return 0.0
+    b, size = np.random.default_rng(1).normal(size=n), 0.0
+    for _ in range(_ROUNDS):
+        x = solve(np.concatenate([np.zeros(m), b / np.linalg.norm(b)]))[m:] / _ALPHA
+        b, size = x, float(np.linalg.norm(x))
+        if not 0.0 < size < np.inf:
+            return 0.0
+    return 1.0 / size
 
 
 def _factors_on(graph: FactorGraph, wanted: np.ndarray) -> list[int]:

@@ -9,7 +9,7 @@ from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_e
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
-from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
@@ -152,11 +152,13 @@ def is_clear(state: I64, totals: F64) -> bool:
     )
 
 
-@inline_kernel
-def never_solved(totals: F64) -> float:
-    """What of the linear problem is not solved where the estimate was put back to the linearization points, from where
-    cliques are solved again only below what moves."""
-    return max(totals[tl.T_CHI2] - totals[tl.T_MODEL], 0.0) if totals[tl.T_LEFT] == math.inf else 0.0
+@kernel("float64(int64[::1], float64[::1])")
+def unsolved(state: I64, totals: F64) -> float:
+    """What of the linear problem is not solved: where something was left behind, and where the estimate was put back to
+    the linearization points, from where cliques are solved again only below what moves."""
+    if state[tl.S_BEHIND] == 0 and totals[tl.T_LEFT] != math.inf:
+        return 0.0
+    return max(totals[tl.T_CHI2] - totals[tl.T_MODEL], 0.0)
 
 
 @inline_kernel
@@ -164,11 +166,12 @@ def note_after(settings: F64, state: I64, totals: F64) -> None:
     """What is to be done after the step, and what the optimum is at least."""
     chi2 = totals[tl.T_CHI2]
     totals[tl.T_ALLOWED] = converged_error(settings, state, totals)
-    # What a budget has put off says nothing of how fast the others converge.
+    # What a budget has put off, or has left behind, says nothing of how fast the others converge.
     put_off = state[tl.S_PENDING] != 0 and settings[tl.P_BUDGET] < math.inf
     unconverged = left(totals) > totals[tl.T_ALLOWED]
-    unsolved = never_solved(totals) > once_slow(settings[tl.P_CONVERGED], state) * (chi2 + LEAST_CHI2)
-    state[tl.S_SLOW] = 1 if (unconverged or unsolved) and not put_off else 0
+    most = once_slow(settings[tl.P_CONVERGED], state) * (chi2 + LEAST_CHI2)
+    never_solved = state[tl.S_BEHIND] == 0 and unsolved(state, totals) > most
+    state[tl.S_SLOW] = 1 if (unconverged or never_solved) and not put_off else 0
     if unconverged and put_off:
         state[tl.S_DUE] = 1
     state[tl.S_AFTER] = 0
