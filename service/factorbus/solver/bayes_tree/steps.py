@@ -338,7 +338,9 @@ class TreeSteps:
         self, started: float, compiled: float, result: Minimization | None, because: str, budget: float, clear: bool
     ) -> StepReport:
         """clear: the step has converged, as its status says."""
-        before, self._mark, self._graph.own_before = self._mark, self._graph.mark(), None
+        before, self._mark = self._mark, self._graph.mark()
+        if self._graph.own_before is not None:
+            self._graph.own_before = None
         now, clock, tree = self._mark, self._options.clock, self._tree
         self._first_new, self._batched = before[at.VARIABLES], result is not None
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = tree.state[_COUNTS].tolist()
