@@ -16,7 +16,7 @@ from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, zero
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, form_of_imu, loss_code
-from factorbus.solver.kernels.model.imu import BIAS_A, IMU_SCRATCH, Scratch, imu_of_delta, put_delta_near
+from factorbus.solver.kernels.model.imu import BIAS_A, IMU_SCRATCH, ImuScratch, imu_of_delta, put_delta_near
 from factorbus.solver.kernels.model.imu_layout import numbers_of_imu
 from factorbus.solver.kernels.model.imu_noise import SIZE
 from factorbus.solver.kernels.model.preintegration import ROOM
@@ -75,7 +75,7 @@ def evaluate_imu(f: int, graph: Graph, tree: Tree, w: F64) -> int:
     """
     var, fac, x = graph.var, graph.fac, graph.values
     places, form, z = np.empty(count_ends(f, fac), np.int64), form_of_imu(f, fac), graph.payload[fac[f, at.F_AT] :]
-    columns, scratch = fill_places(f, var, fac, places), Scratch(w[_ROOM : _ROOM + ROOM], w[_Y:_P])
+    columns, scratch = fill_places(f, var, fac, places), ImuScratch(w[_ROOM : _ROOM + ROOM], w[_Y:_P])
     put_delta_near(form, z, kept_samples(f, var, fac, tree), x[places[BIAS_A] :], scratch.room)
     imu_of_delta(x, places, form, z, scratch, w, w[_P : _P + _DIM * columns].reshape(_DIM, columns))
     whiten_residual(form.start + of.SAMPLE * form.samples, z, w)

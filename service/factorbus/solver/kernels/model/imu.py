@@ -49,7 +49,7 @@ IMU_SCRATCH = _E + 4
 _SMALL = 1e-4
 
 
-class Scratch(NamedTuple):
+class ImuScratch(NamedTuple):
     """Δ, see `make_room`, and room of IMU_SCRATCH numbers."""
 
     room: F64
@@ -73,11 +73,11 @@ def imu_plain(x: F64, places: I64, form: ImuLayout, z: F64, kept: F64, r: F64, J
     """The same without W."""
     bias, room = x[places[BIAS_A] : places[BIAS_A] + of.BIAS], kept if kept.size > 0 else make_room()
     put_delta(form, z, bias, room, True)
-    imu_of_delta(x, places, form, z, Scratch(room, np.empty(IMU_SCRATCH)), r, J)
+    imu_of_delta(x, places, form, z, ImuScratch(room, np.empty(IMU_SCRATCH)), r, J)
 
 
 @part
-def imu_of_delta(x: F64, places: I64, form: ImuLayout, z: F64, scratch: Scratch, r: F64, J: F64) -> None:
+def imu_of_delta(x: F64, places: I64, form: ImuLayout, z: F64, scratch: ImuScratch, r: F64, J: F64) -> None:
     """The same with Δ as it is in `room`."""
     room, y = scratch
     T = room[ROOM_T]

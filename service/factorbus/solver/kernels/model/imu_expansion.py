@@ -51,7 +51,7 @@ def write_expansion(form: ImuLayout, z: F64, walk: Walk) -> None:
     """Write it behind the samples of the measurement that begins at z[0]."""
     k, n, w = expansion_at(form), expansion_at(form) + of.DELTA, walk.lanes
     z[k] = walk.duration
-    z[k + 1], z[k + 2], z[k + 3], z[k + 4] = quaternion_of(w, R * LANES, LANES)
+    z[k + 1], z[k + 2], z[k + 3], z[k + 4] = quaternion_of_lanes(w, R * LANES, LANES)
     for c in range(3):
         z[k + 5 + c], z[k + 8 + c] = w[(P + c) * LANES], w[(V + c) * LANES]
     J = np.empty((LANES, SLOPES))
@@ -82,7 +82,7 @@ def put_slopes(w: F64, m: int, J: F64) -> None:
 
 
 @inline_kernel
-def quaternion_of(w: F64, k: int, step: int) -> tuple:
+def quaternion_of_lanes(w: F64, k: int, step: int) -> tuple:
     """Of the rotation whose numbers are at w[k], w[k + step], …, row by row; the largest of the four is above zero."""
     r0, r1, r2, r3 = w[k], w[k + step], w[k + 2 * step], w[k + 3 * step]
     r4, r5, r6, r7, r8 = w[k + 4 * step], w[k + 5 * step], w[k + 6 * step], w[k + 7 * step], w[k + 8 * step]
