@@ -14,7 +14,8 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.own_clients import JUDGE
 from factorbus.solver import Solver
 from factorbus.solver.closures import ahead, ledger
-from factorbus.solver.closures.judging import ClosureJudge, residuals_weighed
+from factorbus.solver.closures.judging import ClosureJudge
+from factorbus.solver.closures.numbers import residuals_weighed
 from factorbus.solver.divergence import unstage
 from factorbus.solver.errors import NotFinite
 from factorbus.solver.report import StepReport

@@ -15,7 +15,6 @@ from scipy.stats import multivariate_normal
 from examples import examples
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.closures.choosing import largest_agreeing
 from factorbus.solver.closures.evidence import (
     ClosureNumbers,
     FalseSpread,
@@ -24,10 +23,11 @@ from factorbus.solver.closures.evidence import (
     judge_pairs,
 )
 from factorbus.solver.closures.gated import GatedSolver
-from factorbus.solver.closures.judging import CONTRADICTED, closure_numbers
+from factorbus.solver.closures.judging import CONTRADICTED
 from factorbus.solver.closures.ledger import ACCEPTED, REJECTED, RESTORED, SUSPECT, Closure, NotAClosure
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, tangent_of
+from factorbus.solver.closures.numbers import closure_numbers
 from factorbus.solver.closures.policy import ClosurePolicy
 
 _SPREADS = (FalseSpread(5.0, 0.5), FalseSpread(30.0, math.pi))
@@ -165,22 +165,6 @@ def test_half_of_the_distance_counts_in_space() -> None:
     assert far.distance[0] == pytest.approx(4.0)
     assert far.chance[0, 0] / near.chance[0, 0] == pytest.approx(math.e)
     assert near.chance[0, 0] == pytest.approx((2 * math.pi) ** 1.5 * 0.1 * 0.1 * 0.05 / 100.0)
-
-
-@examples(50)
-@given(seed=seeds, n=st.integers(0, 8), share=st.floats(0.2, 0.9))
-def test_the_largest_set_is_what_trying_everything_finds(seed: int, n: int, share: float) -> None:
-    agree = np.random.default_rng(seed).random((n, n)) < share
-    agree = np.triu(agree, 1)
-    agree |= agree.T
-    found = largest_agreeing(agree).tolist()
-
-    def all_agree(some: tuple[int, ...]) -> bool:
-        return all(agree[p, q] for p, q in itertools.combinations(some, 2))
-
-    most = max(len(some) for k in range(n + 1) for some in itertools.combinations(range(n), k) if all_agree(some))
-    assert len(found) == most
-    assert all_agree(tuple(found))
 
 
 def corridor(length: int, sigma: float = 0.02) -> list[Batch]:

@@ -20,13 +20,12 @@ from factorbus.solver.closures.evidence import (
     weights_without,
 )
 from factorbus.solver.closures.gated import GatedSolver
-from factorbus.solver.closures.judging import closure_numbers
 from factorbus.solver.closures.ledger import ACCEPTED, SUSPECT, Closure, ClosureLedger
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.motions import motions_of_poses
+from factorbus.solver.closures.numbers import closure_numbers
 from factorbus.solver.closures.switching import without_factors
 from factorbus.solver.kernels.closures.ahead import (
-    END_ITSELF,
     J_ALLOWED,
     J_BOUND,
     J_MEASURED,
@@ -87,13 +86,18 @@ def test_before_the_step_a_closure_is_judged_as_after_it(new: int, partner: int)
     split, before = forest.split(batch), solver._graph.counts.copy()
     first = solver.stage(batch)
     limits = np.array([16.0, 30.0, 1.0, volume_of(_SPREAD)])
-    foreseen = ahead._foresee(solver, split, np.array([first + new]), before, limits)
+    ledgers = ClosureLedger()
+    ledger = ledgers.of_kind["between_se2"]
+    staged = np.array([before[at.VARIABLES], before[at.FACTORS], 0, 1, first + new])
+    foreseen = ahead._foresee(solver, ledger, split, staged, limits)
     assert foreseen is not None
     assert foreseen.believed == 1
+    ends = ledger.ends[0].copy()
+    for found, wanted in ((ledger.noise, J_NOISE), (ledger.bound, J_BOUND), (ledger.z, J_MEASURED)):
+        np.testing.assert_array_equal(found[0], foreseen.numbers[0, wanted : wanted + 3])
     solver._graph.forget(tuple(before.tolist()))
     solver.stage(batch._replace(factors=tuple(split.trusted)))
     solver.step()
-    ledgers = ClosureLedger()
     ledgers.add(split.closing[0], first + new, solver._graph, 0)
     numbers = closure_numbers(solver, ledgers.of_kind["between_se2"], np.array([0]))
     after = judge_each(numbers, [_SPREAD])
@@ -105,7 +109,7 @@ def test_before_the_step_a_closure_is_judged_as_after_it(new: int, partner: int)
     assert distance == pytest.approx(after.distance[0], rel=1e-2)
     assert chance == pytest.approx(after.chance[0, 0], rel=5e-2)
     assert believed == 1.0
-    ends = solver._graph.var[foreseen.ends[:, END_ITSELF], at.V_AT] // 3
+    ends = solver._graph.var[ends, at.V_AT] // 3
     assert ends.tolist() == [partner, keys[-1]]
     # When it is in, what it was judged by says what the map is without it.
     solver.stage(Batch((), (closing,)))
@@ -130,8 +134,9 @@ def test_what_more_than_odometry_holds_is_judged_after_a_step(further: Factors) 
     made._joined.forget()
     before = made.solver._graph.counts.copy()
     first = made.solver.stage(batch)
-    rows = np.array([first + 2])
-    assert (ahead._foresee(made.solver, split, rows, before, np.ones(4)) is None) != more
+    ledger = made.ledger.of_kind["between_se2"]
+    staged = np.array([before[at.VARIABLES], before[at.FACTORS], ledger.count, 1, first + 2])
+    assert (ahead._foresee(made.solver, ledger, split, staged, np.ones(4)) is None) != more
     made.solver._graph.forget(tuple(before.tolist()))
     report = made.insert(batch)
     assert [c.keys for c in report.accepted] == [(2, 12)]

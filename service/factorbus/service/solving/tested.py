@@ -220,7 +220,9 @@ class TestedMapSolver(MapSolver):
             went_in, moved = isinstance(failed, bytes), moved_closures(c for c in new if c.is_in)
             behind.append(self._entered(entry, moved) if went_in else Verdict((refusal(entry, failed),)))
         if new:
-            is_settled = staged is not None and staged.all_in and self._judge.is_settled(self._ledger)
+            is_settled = (
+                staged is not None and staged.all_in and self._judge.is_settled(self._solver, self._ledger, new)
+            )
             judged = [] if self._replaying or is_settled else list(self._judged(new))
             counted = {**report, "closures": len(new), "suspects": sum(not c.is_in for c in new)}
             number = [(insert.sequence, outcome.first_factor)]

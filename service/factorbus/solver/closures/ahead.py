@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.solver.closures.choosing import PASSED
+from factorbus.solver.closures.expected import ExpectedClosures
 from factorbus.solver.closures.judging import ClosureJudge
-from factorbus.solver.closures.ledger import ACCEPTED, NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts
+from factorbus.solver.closures.ledger import ACCEPTED, NO_VERDICTS, Closure, ClosureLedger, ClosureVerdicts, Ledger
 from factorbus.solver.closures.loops import SplitFactors
 from factorbus.solver.graph.groups import Addition, BatchLike
 from factorbus.solver.kernels.closures import ahead
@@ -21,16 +22,16 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
 
 _PLANE = "between_se2"
+_new = tuple.__new__  # of a named tuple: its own way there is one more function, in code that is cold
 
 
 class Foreseen(NamedTuple):
     """What the map expects of some closures, as `foresee_closures` has it.
 
-    numbers: their judgements.  ends: of both.  believed: how many go in with the step.
+    numbers: their judgements.  believed: how many go in with the step.
     """
 
     numbers: F64
-    ends: I64
     believed: int
 
     @property
@@ -75,21 +76,26 @@ def stage_with_believed(
     given: verdicts on those that are, of a batch that was judged before.
     """
     graph = solver._graph
-    before = graph.counts.copy()
-    first, row, foreseen = solver.stage(batch), before.item(at.FACTORS), None
+    before = graph.counts.tolist()
+    first, row, foreseen = solver.stage(batch), before[at.FACTORS], None
     if given is None:
-        closing_at = split.closing_at
-        rows = graph.rows_of(first + closing_at) if graph.counts.item(at.MEMBERS) else row + closing_at
-        foreseen = _foresee(solver, split, rows, before, judge.limits_ahead(solver, ledgers.of_kind[_PLANE]))
-        if foreseen is not None and foreseen.believed == rows.size:
-            return StagedBatch(split, first, row, [True] * rows.size, foreseen, None, True)
+        places = split.places
+        if graph.counts.item(at.MEMBERS):
+            rows = graph.rows_of(first + split.closing_at).tolist()
+        else:
+            rows = [row + place for place in places]
+        ledger = ledgers.of_kind[_PLANE]
+        new = np.array([before[at.VARIABLES], row, ledger.count, ledgers.looks + 1, *rows])
+        foreseen = _foresee(solver, ledger, split, new, judge.limits_ahead(solver, ledger))
+        if foreseen is not None and foreseen.believed == len(places):
+            return _new(StagedBatch, (split, first, row, [True] * len(places), foreseen, None, True))
     if foreseen is None:
         believed = np.isin(first + split.closing_at, () if given is None else given.factors).tolist()
     else:
         believed = (foreseen.odds[:, ahead.J_BELIEVED] > 0.0).tolist()
     staged = StagedBatch(split, first, row, believed, foreseen, given, all(believed))
     if not staged.all_in:
-        graph.forget(tuple(before.tolist()))
+        graph.forget(tuple(before))
         restage(solver, batch, staged)
     return staged
 
@@ -100,11 +106,14 @@ def restage(solver: Solver, batch: BatchLike, staged: StagedBatch) -> None:
     solver.stage(Addition(batch.variables, [*staged.split.trusted, *believed]))
 
 
-def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, revision: int) -> list[Closure]:
+def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, revision: int) -> Sequence[Closure]:
     """The step of a batch is made: name its factors as if all were in, and write down its closures; gives those."""
     split, graph, first, seen = staged.split, solver._graph, staged.first, staged.foreseen
     if staged.all_in and seen is not None:
-        return _enter_expected(ledgers, split, first, seen, revision)
+        row, odds = ledgers.of_kind[_PLANE].count, seen.numbers[:, ahead.J_ODDS]
+        expected = ExpectedClosures(split.closing, split.places, first, row, odds, revision)
+        ledgers.enter_expected(_PLANE, expected, len(split.places))
+        return expected
     is_in = np.array(staged.believed)
     if not staged.all_in:
         places = np.concatenate([split.trusted_at, split.closing_at[is_in]])
@@ -116,9 +125,11 @@ def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, 
         if is_in.any():
             ledgers.note(staged.verdicts(), revision)
         return added
-    bounds = seen.numbers[:, ahead.J_BOUND : ahead.J_MEASURED]
     if not is_in.all():
-        bounds[~is_in] = np.linalg.inv(seen.numbers[~is_in, ahead.J_ALLOWED : ahead.J_NOISE])
+        ledger = ledgers.of_kind[_PLANE]
+        ledger.bound[ledger.count + np.flatnonzero(~is_in)] = np.linalg.inv(
+            seen.numbers[~is_in, ahead.J_ALLOWED : ahead.J_NOISE]
+        )
     made, odds = list[Closure](), seen.odds.tolist()
     for k, place in enumerate(split.places):
         if staged.believed[k]:
@@ -126,36 +137,22 @@ def enter_closures(solver: Solver, ledgers: ClosureLedger, staged: StagedBatch, 
             made.append(Closure(first + place, 0, split.closing[k], revision, *told))
         else:
             made.append(Closure(first + place, 0, split.closing[k], revision, changed=revision))
-    z, noise = seen.numbers[:, ahead.J_MEASURED :], seen.numbers[:, ahead.J_NOISE : ahead.J_WEIGHT]
-    ledgers.enter(_PLANE, made, seen.ends[:, ahead.END_ITSELF].reshape(-1, 2), z, noise, bounds)
+    ledgers.enter(_PLANE, made)
     return made
 
 
-def _enter_expected(
-    ledgers: ClosureLedger, split: SplitFactors, first: int, seen: Foreseen, revision: int
-) -> list[Closure]:
-    """The same where all went in with the step, as the map expected."""
-    made, n = list[Closure](), len(ledgers.of_kind[_PLANE].closures)
-    of_factor = ledgers.of_factor
-    for factor, place, (d2, p, _) in zip(split.closing, split.places, seen.odds.tolist(), strict=True):
-        closure = of_factor[first + place] = Closure(
-            first + place, n, factor, revision, ACCEPTED, PASSED, d2, p, revision
-        )
-        made.append(closure)
-        n += 1
-    ledgers.enter_accepted(_PLANE, made, seen.ends, seen.numbers)
-    return made
+def _foresee(solver: Solver, ledger: Ledger, split: SplitFactors, staged: I64, limits: F64) -> Foreseen | None:
+    """What the map expects of closures that are staged, whose columns are written behind those of `ledger`; None: it
+    takes the step to say.
 
-
-def _foresee(solver: Solver, split: SplitFactors, closing: I64, before: I64, limits: F64) -> Foreseen | None:
-    """What the map expects of closures in the rows `closing`, which are staged; None: it takes the step to say.
-
-    before: what was in use after the last step.  limits: as of `believe_ahead`.
+    staged: as of `foresee_closures`.  limits: as of `believe_ahead`.
     """
-    for factor in split.closing:
-        if factor.kind != _PLANE:
-            return None
-    n = closing.size
-    ends, numbers = np.empty((2 * n, ahead.END_COLUMNS), np.int64), np.empty((n, ahead.J_SIZE, 3))
-    believed = solver.covariances.try_foresee(before, closing, limits, ends, numbers)
-    return None if believed < 0 else Foreseen(numbers, ends, believed)
+    if split.kind != _PLANE:
+        return None
+    n = len(split.closing)
+    if ledger.count + n > len(ledger.z):
+        ledger.make_room(n)
+    numbers = np.empty((n, ahead.J_SIZE, 3))
+    columns, marks = (ledger.z, ledger.noise, ledger.bound), (ledger.ends, ledger.looked, ledger.is_tested)
+    believed = solver.covariances.try_foresee(staged, limits, columns, marks, numbers)
+    return None if believed < 0 else _new(Foreseen, (numbers, believed))

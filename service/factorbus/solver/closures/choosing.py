@@ -18,6 +18,7 @@ such mistakes.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,12 +26,12 @@ import numpy as np
 from factorbus.solver.closures.evidence import ClosureNumbers, FalseSpread, judge_each, judge_pairs
 from factorbus.solver.closures.policy import ClosurePolicy
 from factorbus.solver.covariance.gates import threshold
+from factorbus.solver.kernels.closures.sets import N_BETWEEN, list_believed, list_rivals, number_places, put_pairs
 from factorbus.solver.kernels.jit.compile import F64, I64
 
 PASSED, AGREES, UNSURE, IMPROBABLE, RIVAL = "passed", "agrees", "unsure", "improbable", "rival"
 LEAST_RIVALS = 3  # that agree, against what the map says
 _LEAST_CHANCE = 1e-12
-_MOST_BRANCHES = 20_000
 
 
 class ClosureOdds(NamedTuple):
@@ -92,6 +93,7 @@ class ClosureLimits(NamedTuple):
     spread: FalseSpread
 
 
+@lru_cache(maxsize=64)
 def limits_of(policy: ClosurePolicy, dims: int) -> ClosureLimits:
     """The limits of a policy."""
     probabilities = policy.closure_gate_probability, policy.closure_out_probability
@@ -102,112 +104,74 @@ def limits_of(policy: ClosurePolicy, dims: int) -> ClosureLimits:
 class _Sets:
     """Sets of closures that agree.
 
-    agree (n, n), chance (n, n, spreads): of each two.  alone (n,): of each, anywhere.
+    agree (n, n).  chances, twice (2, n, n): of each two near and anywhere, and their logarithms.  alone (n,): of each,
+    anywhere.
     """
 
     def __init__(
         self, c: ClosureNumbers, gate: float, spreads: Sequence[FalseSpread], policy: ClosurePolicy, alone: F64
     ) -> None:
         n = len(c.z)
-        i, j = np.triu_indices(n, 1)
+        i, j = _pairs(n)
         pairs = judge_pairs(c, i, j, spreads)
-        self.agree, self.chance = np.zeros((n, n), bool), np.ones((n, n, len(spreads)))
-        self.agree[i, j] = self.agree[j, i] = pairs.distance <= gate
-        self.chance[i, j] = self.chance[j, i] = pairs.chance
-        self.alone, self.numbers, self.policy = alone, c, policy
+        self.agree, self.chances = np.empty((n, n), bool), (np.empty((2, n, n)), np.empty((2, n, n)))
+        own = pairs.chance, np.log(np.maximum(pairs.chance, _LEAST_CHANCE))
+        put_pairs(i, j, pairs.distance, gate, own, self.agree, self.chances)
+        self.alone, self.poses, self.policy = np.ascontiguousarray(alone), (c.a, c.b), policy
 
     def believed(self, among: I64, odds: float) -> tuple[list[int], float]:
         """The largest one among some, or none where it may be chance, and its odds; odds: of mistakes.
 
         Of each member one other says so well where it is that a false one would hardly agree, and of each place the map
-        or another place does: the members of one are one mistake, if they are one.
+        or another place does: the members of one are one mistake, if they are one.  Places are those of members alone:
+        others between them would make two places of one.
         """
-        members, most = self._largest(among), self.policy.closure_chance_max
-        while members.size > 1:
-            sure = self.chance[np.ix_(members, members)][..., 0].min(axis=1) <= most
-            if not sure.all():
-                members = members[sure]
-                continue
-            # Of members alone: others between them would make two places of one.
-            chance, own = self.chance[np.ix_(members, members)], self._places(members)
-            there, place = np.unique(own, return_inverse=True)
-            alone = np.array([odds * self.alone[members[own == p]].min() for p in there])
-            # Of two places the two that are the least likely to agree.
-            between = np.array([[chance[own == p][:, own == q, 1].min() for q in there] for p in there])
-            np.fill_diagonal(between, np.inf)
-            held = np.minimum(alone, odds * between.min(axis=1)) <= most
-            if not held.all():
-                members = members[held[place]]
-                continue
-            logarithm = _chain(between) + math.log(max(float(alone.min()), _LEAST_CHANCE))
-            count = max(np.unique(self._places(among)).size, there.size)
-            by_mistake = _expected(count, there.size, logarithm)
-            is_sure = self._is_set(members, among.size) and by_mistake <= most
-            return (members.tolist(), by_mistake) if is_sure else ([], 1.0)
-        return [], 1.0
+        most = self.policy.closure_chance_max
+        members, numbers = np.empty(among.size, np.int64), np.empty(N_BETWEEN + 2 * among.size)
+        limits = odds, most, self.policy.closure_place_m
+        count = list_believed(self.agree, among, self.chances, self.alone, self.poses, limits, members, numbers)
+        if count < 2:
+            return [], 1.0
+        all_places, places, least, *logarithms = numbers.tolist()
+        there = int(places)
+        between, own = logarithms[: there - 1], logarithms[there - 1 : there + count - 2]
+        logarithm = _sum(between) + math.log(max(least, _LEAST_CHANCE))
+        by_mistake = _expected(max(int(all_places), there), there, logarithm)
+        is_sure = self._is_set(own, count, among.size) and by_mistake <= most
+        return (members[:count].tolist(), by_mistake) if is_sure else ([], 1.0)
 
     def rivals(self, among: I64) -> list[int]:
         """The largest one among some, three or more, that is not by chance of independent ones."""
-        members = self._largest(among)
-        if members.size < LEAST_RIVALS:
+        members, numbers = np.empty(among.size, np.int64), np.empty(among.size)
+        count = list_rivals(self.agree, among, self.chances[1], members, numbers)
+        if count < LEAST_RIVALS:
             return []
-        return members.tolist() if self._is_set(members, among.size) else []
+        return members[:count].tolist() if self._is_set(numbers[: count - 1].tolist(), count, among.size) else []
 
-    def _is_set(self, members: I64, count: int) -> bool:
+    def _is_set(self, logarithms: Sequence[float], size: int, count: int) -> bool:
         """Whether independent false ones, of as many, would hardly agree so."""
-        logarithm = _chain(self.chance[np.ix_(members, members)][..., 0])
-        return _expected(count, members.size, logarithm) <= self.policy.closure_sets_max
-
-    def _places(self, rows: I64) -> I64:
-        return closure_places(self.numbers.a[rows], self.numbers.b[rows], self.policy.closure_place_m)
-
-    def _largest(self, among: I64) -> I64:
-        return among[largest_agreeing(self.agree[np.ix_(among, among)])]
+        return _expected(count, size, _sum(logarithms)) <= self.policy.closure_sets_max
 
 
-def largest_agreeing(agree: np.ndarray) -> I64:
-    """The members, ascending, of a largest set of which each agrees with each other one; agree (n, n), symmetric.
-
-    Branch and bound, for a few dozens.  Of several equal ones the same at every call.
-    """
-    n = len(agree)
-    order = sorted(range(n), key=lambda v: (-int(agree[v].sum()), v))
-    near = {v: {u for u in order if agree[v, u] and u != v} for v in order}
-    best: list[int] = []
-    stack = [([], order)]
-    for _ in range(_MOST_BRANCHES):
-        if not stack:
-            break
-        members, left = stack.pop()
-        if len(members) > len(best):
-            best = members
-        if left and len(members) + len(left) > len(best):
-            first, rest = left[0], left[1:]
-            stack.append((members, rest))
-            stack.append(([*members, first], [u for u in rest if u in near[first]]))
-    return np.array(sorted(best), np.int64)
+@lru_cache(maxsize=128)
+def _pairs(n: int) -> tuple[I64, I64]:
+    """Each two of n."""
+    i, j = np.triu_indices(n, 1)
+    return i, j
 
 
 def closure_places(a: F64, b: F64, within_m: float) -> I64:
     """(n,): the first of those before it, or itself, that is between the same two places; it is none of another's."""
-    near = [np.linalg.norm(T[:, None, :-1, -1] - T[None, :, :-1, -1], axis=-1) <= within_m for T in (a, b)]
-    same, number = near[0] & near[1], np.arange(len(a))
-    for k in range(len(number)):
-        first = np.flatnonzero(same[k, : k + 1] & (number[: k + 1] == np.arange(k + 1)))
-        number[k] = first[0]
-    return number
+    places = np.empty(len(a), np.int64)
+    number_places(np.arange(len(a)), (a, b), within_m, places)
+    return places
 
 
-def _chain(chance: F64) -> float:
-    """Σ ln p over the tree that joins all of n by the least likely agreements; chance (n, n)."""
-    logarithm = np.log(np.maximum(chance, _LEAST_CHANCE))
-    nearest, total = logarithm[0].copy(), 0.0
-    nearest[0] = np.inf
-    for _ in range(1, len(chance)):
-        k = int(nearest.argmin())
-        total += float(nearest[k])
-        nearest = np.where(np.isinf(nearest), np.inf, np.minimum(nearest, logarithm[k]))
-        nearest[k] = np.inf
+def _sum(logarithms: Sequence[float]) -> float:
+    """One after the other, as they come."""
+    total = 0.0
+    for each in logarithms:
+        total += each
     return total
 
 

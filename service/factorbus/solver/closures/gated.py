@@ -7,10 +7,11 @@
 All of it follows from what was inserted: the same batches give the same verdicts, and the same bits.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from factorbus.solver.changing import try_change, with_changes
-from factorbus.solver.closures.ahead import StagedBatch, enter_closures, restage, stage_with_believed
+from factorbus.solver.closures.ahead import enter_closures, restage, stage_with_believed
 from factorbus.solver.closures.judging import ClosureJudge
 from factorbus.solver.closures.ledger import REJECTED, RESTORED, SUSPECT, Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.closures.loops import TrustedForest
@@ -22,6 +23,8 @@ from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
 
+_new = tuple.__new__  # as in `ahead`
+
 
 class GatedReport(NamedTuple):
     """What one insert did: the report of its last step, and the closures whose state it changed.
@@ -30,7 +33,7 @@ class GatedReport(NamedTuple):
     """
 
     step: StepReport
-    accepted: tuple[Closure, ...] = ()
+    accepted: Sequence[Closure] = ()
     suspects: tuple[Closure, ...] = ()
     contradicted: tuple[Closure, ...] = ()
 
@@ -54,36 +57,33 @@ class GatedSolver:
 
         Raises what `Solver.stage` and `step` do; nothing has changed then.
         """
-        split, staged = self._joined.split(batch), None
+        split = self._joined.split(batch)
         try:
-            if split.closing:
-                staged = stage_with_believed(self.solver, self.ledger, batch, split, self.judge)
-                report, staged = self._step(batch, staged)
-            else:
+            if not split.closing:
                 self.solver.stage(batch)
+                report = self.solver.step()
+                self._steps += 1
+                return _new(GatedReport, (report, (), (), ()))
+            staged = stage_with_believed(self.solver, self.ledger, batch, split, self.judge)
+            try:
+                report = self.solver.step()
+            except SolverError:
+                if not any(staged.believed):
+                    raise
+                staged = staged._replace(believed=[False] * len(staged.believed), all_in=False)
+                restage(self.solver, batch, staged)
                 report = self.solver.step()
         except SolverError:
             self._joined.forget()
             raise
         self._steps += 1
-        return GatedReport(report) if staged is None else self._judged(report, staged)
-
-    def _step(self, batch: BatchLike, staged: StagedBatch) -> tuple[StepReport, StagedBatch]:
-        """The step of what is staged; where it fails with closures, that without them."""
-        try:
-            return self.solver.step(), staged
-        except SolverError:
-            if not any(staged.believed):
-                raise
-            staged = staged._replace(believed=[False] * len(staged.believed), all_in=False)
-            restage(self.solver, batch, staged)
-            return self.solver.step(), staged
-
-    def _judged(self, report: StepReport, staged: StagedBatch) -> GatedReport:
-        """The closures of a batch are written down and judged, now that the rest of it is in."""
         new = enter_closures(self.solver, self.ledger, staged, self._steps)
-        if staged.all_in and self.judge.is_settled(self.ledger):
-            return GatedReport(report, tuple(new))
+        if staged.all_in and self.judge.is_settled(self.solver, self.ledger, new):
+            return _new(GatedReport, (report, new, (), ()))
+        return self._judged(report, new)
+
+    def _judged(self, report: StepReport, new: Sequence[Closure]) -> GatedReport:
+        """New closures are judged, with suspects, now that the rest of their batch is in."""
         moved = dict[int, bool]()
         for verdicts in self.judge.looks(lambda: self.solver, self.ledger, new):
             for c in self.ledger.named(verdicts.factors.tolist()):

@@ -37,6 +37,7 @@ from factorbus.solver.closures.evidence import (
     volume_of,
     weights_without,
 )
+from factorbus.solver.closures.expected import ExpectedClosures
 from factorbus.solver.closures.ledger import (
     ACCEPTED,
     SUSPECT,
@@ -46,14 +47,13 @@ from factorbus.solver.closures.ledger import (
     Ledger,
     verdicts_of,
 )
-from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, tangent_of
+from factorbus.solver.closures.numbers import closure_numbers, residuals_weighed
 from factorbus.solver.closures.policy import ClosurePolicy
 from factorbus.solver.closures.switching import without_factors
-from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.kernels.looked_back import WORST
 from factorbus.solver.errors import SolverError
-from factorbus.solver.kernels.closures.ahead import list_companions, weigh_residuals
-from factorbus.solver.kernels.closures.back import count_in_spread
+from factorbus.solver.kernels.closures.ahead import list_companions
+from factorbus.solver.kernels.closures.back import count_in_spread, is_any_due, longest_side
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.solver import Solver
@@ -82,12 +82,17 @@ class ClosureJudge:
 
     def limits_ahead(self, solver: Solver, ledger: Ledger) -> F64:
         """As `believe_ahead` takes them, the same array each time."""
-        self._ahead[2] = self.policy.closure_chance_max / self._odds(solver, ledger).false
+        share = self._share_near(solver, ledger) if ledger.improbable else 1.0
+        self._ahead[2] = self.policy.closure_chance_max / ledger.odds_false(share)
         return self._ahead
 
-    def is_settled(self, ledgers: ClosureLedger) -> bool:
+    def is_settled(self, solver: Solver, ledgers: ClosureLedger, new: Sequence[Closure]) -> bool:
         """Whether `looks` has nothing to say behind an insert whose closures all went in with its step."""
-        return not ledgers.suspect_count and ledgers.looks % _LOOK_BACK_EVERY > 0
+        if ledgers.looks % _LOOK_BACK_EVERY == 0:
+            return False
+        if not ledgers.suspect_count:
+            return True
+        return isinstance(new, ExpectedClosures) and not self._is_any_due(solver, ledgers, ledgers.of_kind[new.KIND])
 
     def looks(
         self, solver: Callable[[], Solver], ledgers: ClosureLedger, new: Sequence[Closure]
@@ -96,8 +101,9 @@ class ClosureJudge:
 
         Where the map expected all of them, what it has is seldom contradicted: that is looked at now and then.
         """
-        looks_back = not all(c.is_in for c in new) or ledgers.looks % _LOOK_BACK_EVERY == 0
-        for kind in dict.fromkeys(c.factor.kind for c in new):
+        is_expected = isinstance(new, ExpectedClosures)
+        looks_back = ledgers.looks % _LOOK_BACK_EVERY == 0 or not (is_expected or all(c.is_in for c in new))
+        for kind in (new.KIND,) if is_expected else dict.fromkeys(c.factor.kind for c in new):
             while (verdicts := self.look(solver(), ledgers, kind)) is not None:
                 yield verdicts
             if looks_back and (verdicts := self.look_back(solver(), ledgers, kind)) is not None:
@@ -108,10 +114,10 @@ class ClosureJudge:
         suspects that may be believed now; None: there are none.  Raises SolverError.
         """
         ledger = ledgers.of_kind[kind]
-        if not ledgers.suspect_count or self._is_alone_beyond(solver, ledgers, ledger):
+        if not ledgers.suspect_count or not self._is_any_due(solver, ledgers, ledger):
             return None
         new = ledger.unjudged()[:_TOGETHER]
-        if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: len(ledger.closures)].any():
+        if not (new.size or ledgers.looks == ledgers.moved_at) or not ledger.is_suspect[: ledger.count].any():
             return None
         looked_at, settled = self._revisited(solver, ledgers, ledger, new)
         alone = self._improbable(solver, ledger, settled)
@@ -126,28 +132,33 @@ class ClosureJudge:
             rows = [row for row in rows if row[0].factor_id not in again] + tried
         return verdicts_of(rows + alone)
 
-    def _is_alone_beyond(self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger) -> bool:
-        """Whether there is one suspect, which was looked at, and is outside the gate by its bound: it stays what it is.
+    def _is_any_due(self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger) -> bool:
+        """Whether any suspect is new, or may be believed now that others went in or out; of those in space it may be.
 
-        One by itself is believed within the gate alone; what agrees with others may be beyond it.
+        One by itself is believed within the gate alone, and outside by its bound it stays what it is; what agrees with
+        others may be beyond the gate.
         """
-        if ledgers.suspect_count != 1 or not ledger.closures:
-            return False
-        row = int(ledger.is_suspect[: len(ledger.closures)].argmax())
-        if not ledger.is_improbable[row]:
-            return False
-        return residuals_weighed(solver, ledger, np.array([row])).item() > self.limits[ledger.dim].gate
+        if ledger.dim != _PLANE_DIM:
+            return True
+        moved_at = ledgers.moved_at if ledgers.looks == ledgers.moved_at else -1
+        gate, out, _ = self.limits[_PLANE_DIM]
+        return is_any_due(
+            (ledger.is_suspect, ledger.is_new, ledger.is_improbable),
+            ledger.looked,
+            (ledger.count, moved_at),
+            ledger.ends,
+            (ledger.z, ledger.bound),
+            solver._graph.array_table,
+            (gate if ledgers.suspect_count == 1 else out, out),
+        )
 
     def look_back(self, solver: Solver, ledgers: ClosureLedger, kind: str) -> ClosureVerdicts | None:
         """The worst of those accepted, where it is improbable; None: none is.  Raises SolverError."""
         ledger = ledgers.of_kind[kind]
-        tested, most = ledger.tested(), self.policy.closure_retests
-        if tested.size > most:
-            tested = tested[(ledgers.looks * most + np.arange(most)) % tested.size]
-        if not tested.size:
+        if not ledger.accepted:
             return None
-        out = self.limits[ledger.dim].out
-        if (worst := _contradicted(solver, ledger, tested, out)) < 0:
+        out, looked_at = self.limits[ledger.dim].out, (ledger.count, self.policy.closure_retests, ledgers.looks)
+        if (worst := _contradicted(solver, ledger, looked_at, out)) < 0:
             return None
         row = np.array([worst])
         ledger.bound[row] = exact_weights_without(closure_numbers(solver, ledger, row))
@@ -171,17 +182,20 @@ class ClosureJudge:
         """
         if not ledger.improbable or ledger.dim != _PLANE_DIM:
             return ledger.odds()
-        rows = np.flatnonzero(ledger.is_improbable[: len(ledger.closures)])[-_MOST_COUNTED:]
-        spread, table = self.limits[ledger.dim].spread, solver._graph.array_table
-        near = count_in_spread(rows, ledger.ends, ledger.z, table, spread.metres, spread.radians)
-        return ledger.odds(near / rows.size)
+        return ledger.odds(self._share_near(solver, ledger))
+
+    def _share_near(self, solver: Solver, ledger: Ledger) -> float:
+        """Of the newest improbable ones in the plane, the share of those that are within the policy's spread."""
+        among, table = (ledger.count, _MOST_COUNTED), solver._graph.array_table
+        own = self.limits[_PLANE_DIM].spread
+        spread = own.metres, own.radians
+        near, count = count_in_spread(ledger.is_improbable, among, ledger.ends, ledger.z, table, spread)
+        return near / count
 
     def _extent(self, solver: Solver, ledger: Ledger) -> float:
         """Half the length of the map: mistakes may lead to wherever it has poses."""
-        graph = solver._graph
-        var = graph.var[: graph.counts[at.VARIABLES]]
-        starts = var[var[:, at.V_KIND] == (at.SE2 if ledger.dim == _PLANE_DIM else at.SE3), at.V_AT]
-        return float(np.ptp(graph.values[starts[:, None] + np.arange(2)], axis=0).max()) / 2.0
+        kind = at.SE2 if ledger.dim == _PLANE_DIM else at.SE3
+        return longest_side(solver._graph.array_table, kind) / 2.0
 
     def _revisited(self, solver: Solver, ledgers: ClosureLedger, ledger: Ledger, new: I64) -> tuple[I64, I64]:
         """What to look at, and new ones that are improbable, as too few agree with them for the map to be wrong.
@@ -191,7 +205,7 @@ class ClosureJudge:
         longest.
         """
         most, out, settled, picked = self.policy.closure_revisits, self.limits[ledger.dim].out, new[:0], new
-        count = len(ledger.closures)
+        count = ledger.count
         others = ledger.is_suspect[:count] & ~ledger.is_new[:count]
         if new.size:
             among = np.flatnonzero(others)[-COMPARED:]
@@ -323,23 +337,18 @@ def _places(numbers: ClosureNumbers, policy: ClosurePolicy) -> I64:
     return closure_places(numbers.a, numbers.b, policy.closure_place_m)
 
 
-def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:
-    """rᵀ W r (n,) of some closures, W their bounds."""
-    if ledger.dim == _PLANE_DIM:
-        out = np.empty(rows.size)
-        weigh_residuals(rows, ledger.ends, ledger.z, ledger.bound, solver._graph.array_table, out)
-        return out
-    now = closure_numbers(solver, ledger, rows, False)
-    r = tangent_of(inverse_motion(now.z) @ inverse_motion(now.a) @ now.b)
-    return np.einsum("na,nab,nb->n", r, ledger.bound[rows], r)
+def _contradicted(solver: Solver, ledger: Ledger, looked_at: tuple[int, int, int], out: float) -> int:
+    """The row of the worst of those whose d² is beyond `out` by their bounds, which are made anew; −1: none is.
 
-
-def _contradicted(solver: Solver, ledger: Ledger, tested: I64, out: float) -> int:
-    """The row of the worst of those whose d² is beyond `out` by their bounds, which are made anew; −1: none is."""
+    looked_at: as of `find_contradicted`.
+    """
     if ledger.dim == _PLANE_DIM:
-        columns = ledger.z, ledger.noise, ledger.bound
-        if (found := solver.covariances.try_contradicted(tested, ledger.ends, columns, out)) is not None:
+        columns, source = (ledger.z, ledger.noise, ledger.bound), solver.covariances
+        if (found := source.try_contradicted(ledger.is_tested, looked_at, ledger.ends, columns, out)) is not None:
             return found
+    tested, (_, most, look) = ledger.tested(), looked_at
+    if tested.size > most:
+        tested = tested[(look * most + np.arange(most)) % tested.size]
     worst = _worst(solver, ledger, tested, out)
     if not worst.size:
         return -1
@@ -354,27 +363,6 @@ def _worst(solver: Solver, ledger: Ledger, tested: I64, out: float) -> I64:
     worst = np.flatnonzero(~(most_likely <= out))
     order = np.argsort(-np.nan_to_num(most_likely[worst], nan=np.inf), kind="stable")
     return tested[worst[order[:WORST]]]
-
-
-def closure_numbers(solver: Solver, ledger: Ledger, rows: I64, with_covariance: bool = True) -> ClosureNumbers:
-    """Of some closures, with the poses they are between as the solver has them."""
-    ends, graph = ledger.ends[rows], solver._graph
-    listed = ends.reshape(-1).tolist()
-    place = {v: k for k, v in enumerate(dict.fromkeys(listed))}
-    different, where = np.array(list(place), np.int64), np.array([place[v] for v in listed], np.int64)
-    T = motions_of_poses(graph.values[graph.var[different, at.V_AT, None] + np.arange(ledger.size)])[where]
-    known = np.empty((0, 0))
-    if with_covariance:
-        source, d = solver.covariances, ledger.dim
-        is_free = bool((graph.var[different, at.V_SCALAR] >= 0).all())
-        known = source.try_joint(different) if is_free else None
-        if known is None:
-            known = CovarianceBlocks(source.try_view() or source.factored()).joint(different)
-        if different.size < where.size:
-            scalars = (where[:, None] * d + np.arange(d)).reshape(-1)
-            known = known[scalars[:, None], scalars]
-    a, b = np.ascontiguousarray(T[0::2]), np.ascontiguousarray(T[1::2])
-    return ClosureNumbers(a, b, ledger.z[rows], ledger.noise[rows], known)
 
 
 def _rows(ledger: Ledger, rows: I64, chosen: Chosen) -> list[_Row]:

@@ -15,7 +15,6 @@ from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.arenas import with_room
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import FactorGroup, FactorsLike
-from factorbus.solver.kernels.closures.ahead import enter_judged
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.wording import counted
 
@@ -100,7 +99,7 @@ NO_VERDICTS = ClosureVerdicts(_NONE, (), (), np.empty(0), np.empty(0), _NONE)
 
 
 class Ledger:
-    """Closures of one kind.
+    """Closures of one kind.  What is in rows behind them means nothing: it may be of a batch whose step failed.
 
     z (n, k, k), noise (n, d, d): what was measured, and Ω⁻¹ in its tangent space, metres and radians.
     bound (n, d, d): rᵀ W r is no less than d² of one that is in, and no more than that of a suspect, for as long as the
@@ -109,52 +108,53 @@ class Ledger:
     is_new, is_improbable, is_rival (n,): a suspect for that reason, rivals are improbable, too; accepted, improbable,
     rivals: how many are in, and are that.
     looked (n,): when it was last looked at, in looks.  All columns have room behind for more.
+    count: how many there are.  unlisted: those that nobody has asked for since they came.
     """
 
     def __init__(self, kind: str) -> None:
         self.kind, self.size, self.dim = kind, POSES_BETWEEN[kind], 3 if kind == "between_se2" else 6
-        self.closures: list[Closure] = []
+        self._listed: list[Closure] = []
+        self.unlisted: list[Sequence[Closure]] = []
         k, d = 3 if self.dim == 3 else 4, self.dim
         self.z, self.noise, self.bound = np.zeros((0, k, k)), np.zeros((0, d, d)), np.zeros((0, d, d))
         self.ends, self.looked = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
         self.is_suspect, self.is_new, self.is_tested = (np.zeros(0, bool) for _ in range(3))
         self.is_improbable, self.is_rival = np.zeros(0, bool), np.zeros(0, bool)
-        self.accepted = self.improbable = self.rivals = 0
+        self.accepted = self.improbable = self.rivals = self.count = 0
+
+    @property
+    def closures(self) -> list[Closure]:
+        """By their rows."""
+        if self.unlisted:
+            unlisted, self.unlisted = self.unlisted, []
+            for new in unlisted:
+                self._listed += new
+        return self._listed
 
     def add(self, closure: Closure, ends: Sequence[int], looked: int) -> None:
         """One more."""
-        n = closure.row = len(self.closures)
-        self._make_room(n + 1)
+        n = closure.row = self.count
+        self.make_room(1)
         self.closures.append(closure)
-        self.ends[n], self.looked[n] = ends, looked
+        self.count += 1
+        self.ends[n], self.looked[n], self.is_tested[n] = ends, looked, False
         self.mark(closure)
         self.measure(closure, closure.factor)
 
-    def enter(self, new: Sequence[Closure], ends: I64, looked: int, z: F64, noise: F64, bound: F64) -> None:
-        """Several more, of which these columns are known."""
-        n, count = len(self.closures), len(self.closures) + len(new)
-        self._make_room(count)
-        self.ends[n:count] = ends
-        self.looked[n:count] = [looked + (closure.state == ACCEPTED) for closure in new]
-        self.z[n:count], self.noise[n:count], self.bound[n:count] = z, noise, bound
-        for row, closure in enumerate(new, n):
-            closure.row = row
+    def enter(self, new: Sequence[Closure], looked: int) -> None:
+        """Several more, which `foresee_closures` has measured in the rows behind."""
+        for row, closure in enumerate(new, self.count):
+            closure.row, is_in = row, closure.state == ACCEPTED
+            self.looked[row] = looked + is_in
             self.is_suspect[row] = self.is_new[row] = closure.state == SUSPECT
-            self.is_tested[row] = closure.state == ACCEPTED
-            self.accepted += closure.state == ACCEPTED
-        self.closures += new
+            self.is_tested[row] = is_in
+            self.accepted += is_in
+        self.count += len(new)
+        self.closures.extend(new)
 
-    def enter_accepted(self, new: Sequence[Closure], ends: I64, looked: int, numbers: F64) -> None:
-        """The same of several that are all accepted, in rows which they know; numbers: of `judge_ahead`."""
-        n = len(self.closures)
-        self._make_room(n + len(new))
-        enter_judged(n, numbers, ends, self.z, self.noise, self.bound, self.ends)
-        self.looked[n : n + len(new)], self.is_tested[n : n + len(new)] = looked, True
-        self.accepted += len(new)
-        self.closures += new
-
-    def _make_room(self, need: int) -> None:
-        if need > len(self.z):
+    def make_room(self, more: int) -> None:
+        """For so many behind."""
+        if (need := self.count + more) > len(self.z):
             need = max(need, _ROOM)
             for name in _COLUMNS:
                 setattr(self, name, with_room(getattr(self, name), need))
@@ -188,21 +188,25 @@ class Ledger:
         Improbable ones count as false, those that are in as right; as mistakes that bring several at one place, rivals.
         share: of the improbable ones without rivals, how many count.
         """
+        mistaken = _BURST + self.rivals
+        return ClosureOdds(self.odds_false(share), min(mistaken / (_BURST + self.accepted), 1.0))
+
+    def odds_false(self, share: float = 1.0) -> float:
+        """The first of them alone."""
         alone = self.improbable - self.rivals
-        false, mistaken = 1 + self.rivals + share * alone, _BURST + self.rivals
-        return ClosureOdds(min(false / (1 + self.accepted), 1.0), min(mistaken / (_BURST + self.accepted), 1.0))
+        return min((1 + self.rivals + share * alone) / (1 + self.accepted), 1.0)
 
     def suspects(self) -> I64:
         """Rows."""
-        return np.flatnonzero(self.is_suspect[: len(self.closures)])
+        return np.flatnonzero(self.is_suspect[: self.count])
 
     def tested(self) -> I64:
         """Rows."""
-        return np.flatnonzero(self.is_tested[: len(self.closures)])
+        return np.flatnonzero(self.is_tested[: self.count])
 
     def unjudged(self) -> I64:
         """Rows of suspects that nobody has looked at."""
-        return np.flatnonzero(self.is_new[: len(self.closures)])
+        return np.flatnonzero(self.is_new[: self.count])
 
 
 class ClosureLedger:
@@ -213,9 +217,18 @@ class ClosureLedger:
 
     def __init__(self) -> None:
         self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
-        self.of_factor: dict[int, Closure] = {}
+        self._of_factor: dict[int, Closure] = {}
+        self._unlisted: list[Sequence[Closure]] = []
         self.looks = self.moved_at = 0
         self._counts: dict[str, int] = dict.fromkeys(CLOSURE_STATES, 0)
+
+    @property
+    def of_factor(self) -> dict[int, Closure]:
+        """All by the ids of their factors."""
+        if self._unlisted:
+            unlisted, self._unlisted = self._unlisted, []
+            self._of_factor.update((c.factor_id, c) for new in unlisted for c in new)
+        return self._of_factor
 
     @property
     def closures(self) -> list[Closure]:
@@ -234,24 +247,28 @@ class ClosureLedger:
         self._counts[SUSPECT] += 1
         return closure
 
-    def enter(self, kind: str, new: Sequence[Closure], ends: I64, z: F64, noise: F64, bound: F64) -> None:
-        """New ones of a kind, with their columns; of those that are in that is a look."""
-        self.of_kind[kind].enter(new, ends, self.looks, z, noise, bound)
+    def enter(self, kind: str, new: Sequence[Closure]) -> None:
+        """New ones of a kind, which `foresee_closures` has measured; of those that are in that is a look."""
+        self.of_kind[kind].enter(new, self.looks)
         if any(closure.is_in for closure in new):
             self.looks += 1
             self.moved_at = self.looks
-        self.of_factor |= {closure.factor_id: closure for closure in new}
+        self.of_factor.update((closure.factor_id, closure) for closure in new)
         for closure in new:
             self._counts[closure.state] += 1
 
-    def enter_accepted(self, kind: str, new: Sequence[Closure], ends: I64, numbers: F64) -> None:
-        """The same of several that are all accepted, in rows which they know, and are in `of_factor`; numbers: of
-        `judge_ahead`.
+    def enter_expected(self, kind: str, new: Sequence[Closure], count: int) -> None:
+        """The same of several, `count`, that are all accepted, and know their rows: listed when somebody asks for any.
+
+        `looked` and `is_tested` are written, too.
         """
-        self.looks += 1
-        self.moved_at = self.looks
-        self.of_kind[kind].enter_accepted(new, ends, self.looks, numbers)
-        self._counts[ACCEPTED] += len(new)
+        ledger = self.of_kind[kind]
+        self.looks = self.moved_at = self.looks + 1
+        ledger.accepted += count
+        ledger.count += count
+        ledger.unlisted.append(new)
+        self._unlisted.append(new)
+        self._counts[ACCEPTED] += count
 
     @property
     def suspect_count(self) -> int:
@@ -367,21 +384,6 @@ def verdicts_of(rows: Iterable[tuple[Closure, str, str, float, float, int]]) -> 
         np.array([row[4] for row in listed], np.float64),
         np.array([row[5] for row in listed], np.int64),
     )
-
-
-def pick_row(group: FactorsLike, k: int) -> FactorGroup:
-    """One factor of a group."""
-    own = slice(k, k + 1)
-    scale = None if group.scale is None else group.scale[own].copy()
-    picked = group.keys[own].copy(), group.measured[own].copy(), group.information[own].copy()
-    return FactorGroup(group.kind, *picked, group.loss, scale)
-
-
-def pick_rows(group: FactorsLike, chosen: np.ndarray | I64) -> FactorGroup:
-    """Some factors of a group."""
-    scale = None if group.scale is None else group.scale[chosen]
-    picked = group.keys[chosen], group.measured[chosen], group.information[chosen]
-    return FactorGroup(group.kind, *picked, group.loss, scale)
 
 
 def _noise(factor: FactorsLike, d: int) -> F64:

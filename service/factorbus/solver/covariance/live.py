@@ -3,11 +3,11 @@
 import numpy as np
 
 from factorbus.solver.bayes_tree.tree import CliqueTree
-from factorbus.solver.covariance.kernels.foreseen import foresee_closures
 from factorbus.solver.covariance.kernels.looked_back import find_contradicted
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.square_root import DIMS
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.kernels.closures.back import Bools
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
@@ -18,16 +18,12 @@ class Live:
     def __init__(self, graph: FactorGraph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
 
-    def foresee(self, before: I64, closing: I64, limits: F64, ends: I64, out: F64) -> int:
-        """See `foresee_closures`."""
-        return foresee_closures(
-            before, closing, self._graph.array_table, self._tree.array_table, DIMS, limits, ends, out
-        )
-
-    def contradicted(self, rows: I64, ends: I64, columns: tuple[F64, F64, F64], most: float) -> int:
+    def contradicted(
+        self, is_tested: Bools, looked_at: tuple[int, int, int], ends: I64, columns: tuple[F64, F64, F64], most: float
+    ) -> int:
         """See `find_contradicted`."""
         tables = self._graph.array_table, self._tree.array_table
-        return find_contradicted(rows, ends, columns, *tables, DIMS, most)
+        return find_contradicted(is_tested, looked_at, ends, columns, *tables, DIMS, most)
 
     def joint(self, variables: I64, scalars: int | None = None) -> F64:
         """(d, d): of different free variables together, in their order; scalars: d, where that is known."""

@@ -5,8 +5,10 @@ from functools import partial
 
 from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import CliqueTree
+from factorbus.solver.covariance.kernels.foreseen import foresee_closures
 from factorbus.solver.covariance.live import Live
 from factorbus.solver.covariance.square_root import (
+    DIMS,
     SquareRoot,
     computed_square_root,
     copied_square_root,
@@ -14,6 +16,7 @@ from factorbus.solver.covariance.square_root import (
 )
 from factorbus.solver.covariance.upkeep import Upkeep
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.kernels.closures.back import Bools
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.stepper import Stepper
 
@@ -61,17 +64,26 @@ class CovarianceSource:
         """What keeps all diagonal blocks of the covariance up, updated after every step.  None: as for `try_view`."""
         return Upkeep(self._graph, self._tree) if self._tree else None
 
-    def try_foresee(self, before: I64, closing: I64, limits: F64, ends: I64, out: F64) -> int:
-        """Judge loop closures before their step, as `kernels.closures.ahead` does; gives how many are believed, below
-        0: that cannot be done.
+    def try_foresee(
+        self, staged: I64, limits: F64, columns: tuple[F64, F64, F64], marks: tuple[I64, I64, Bools], out: F64
+    ) -> int:
+        """Judge loop closures before their step, as `foresee_closures` does; gives how many are believed, below 0: that
+        cannot be done.
 
-        before: what was in use after the last step.  closing: rows of factors.  ends, out: what is found.
+        marks: `ends`, `looked` and `is_tested` of a ledger.
         """
-        return -1 if self._live is None else self._live.foresee(before, closing, limits, ends, out)
+        if self._steps is None or (tree := self._steps.tree).raised:
+            return -1
+        ends, looked, is_tested = marks
+        tables = self._graph.array_table, tree.array_table, DIMS, looked
+        return foresee_closures(staged, tables, limits, columns, ends, is_tested, out)
 
-    def try_contradicted(self, rows: I64, ends: I64, columns: tuple[F64, F64, F64], most: float) -> int | None:
+    def try_contradicted(
+        self, is_tested: Bools, looked_at: tuple[int, int, int], ends: I64, columns: tuple[F64, F64, F64], most: float
+    ) -> int | None:
         """The loop closure that the map contradicts most, as `find_contradicted` says it.  None: as for `try_view`."""
-        return self._live.contradicted(rows, ends, columns, most) if self._live else None
+        live = self._live
+        return live.contradicted(is_tested, looked_at, ends, columns, most) if live else None
 
     def try_joint(self, variables: I64, scalars: int | None = None) -> F64 | None:
         """The joint covariance of a few different free variables (by index) as of the last step, read from R in place.
