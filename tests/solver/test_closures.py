@@ -27,7 +27,7 @@ from factorbus.solver.closures.judging import CONTRADICTED
 from factorbus.solver.closures.ledger import ACCEPTED, REJECTED, RESTORED, SUSPECT, Closure, NotAClosure
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, tangent_of
-from factorbus.solver.closures.numbers import closure_numbers
+from factorbus.solver.closures.numbers import closure_numbers, unsure_where_unknown
 from factorbus.solver.closures.policy import ClosurePolicy
 
 _SPREADS = (FalseSpread(5.0, 0.5), FalseSpread(30.0, math.pi))
@@ -311,6 +311,19 @@ def test_accepted_ones_are_entry_against_the_map_without_them() -> None:
     made.reject(17)
     alone = judge_each(closure_numbers(made.solver, ledger, np.array([1])), _SPREADS).distance[0]
     assert distance == pytest.approx(alone, rel=0.02)  # but for the second order of headings
+
+
+@pytest.mark.parametrize("d", [3, 6])
+def test_a_closure_whose_covariance_is_beyond_doubles_is_expected_by_nobody_and_the_others_as_ever(d: int) -> None:
+    """In space its eigenvalues were asked for, and no closure of the map was judged any more."""
+    c = closures_between(3, d, np.random.default_rng(d), 0.01)
+    known = c.known.copy()
+    known[:d], known[:, :d] = np.nan, np.inf  # an end of the first one
+    found = judge_each(c._replace(known=unsure_where_unknown(known)), _SPREADS)
+    wanted = judge_each(c, _SPREADS)
+    assert (found.chance[0] == 1.0).all()
+    np.testing.assert_array_equal(found.chance[1:], wanted.chance[1:])
+    np.testing.assert_array_equal(found.distance[1:], wanted.distance[1:])
 
 
 def test_drives_with_false_closures_and_without() -> None:

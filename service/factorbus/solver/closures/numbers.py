@@ -32,7 +32,7 @@ def closure_numbers(solver: Solver, ledger: Ledger, rows: I64, with_covariance: 
         known = _try_known_in_plane(solver, ledger, rows) if ledger.dim == _PLANE_DIM else None
         known = _known(solver, ends, ledger.dim) if known is None else known
         if not math.isfinite(known.sum()):
-            known = _unsure_where_unknown(known)
+            known = unsure_where_unknown(known)
     T = motions_of_poses(values)
     a, b = np.ascontiguousarray(T[0::2]), np.ascontiguousarray(T[1::2])
     return ClosureNumbers(a, b, ledger.z[rows], ledger.noise[rows], known)
@@ -72,7 +72,7 @@ def _known(solver: Solver, ends: I64, d: int) -> F64:
     return known
 
 
-def _unsure_where_unknown(known: F64) -> F64:
+def unsure_where_unknown(known: F64) -> F64:
     """Numbers whose covariance is beyond doubles, as next to what hardly holds a map, have a large one, and nothing in
     common with others: so what is between them can be expected by nobody, and waits."""
     unknown = ~np.isfinite(known).all(axis=1)
