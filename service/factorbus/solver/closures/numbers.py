@@ -9,7 +9,7 @@ from factorbus.solver.closures.ledger import Ledger
 from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, tangent_of
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.kernels.closures.ahead import weigh_residuals
-from factorbus.solver.kernels.closures.back import list_free_ends, put_known, put_poses
+from factorbus.solver.kernels.closures.back import Bools, list_free_ends, put_known, put_poses
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import MOST_NUMBER
@@ -75,10 +75,15 @@ def _known(solver: Solver, ends: I64, d: int) -> F64:
 def unsure_where_unknown(known: F64) -> F64:
     """Numbers whose covariance is beyond doubles, as next to what hardly holds a map, have a large one, and nothing in
     common with others: so what is between them can be expected by nobody, and waits."""
-    unknown = ~np.isfinite(known).all(axis=1)
-    out = np.where(unknown[:, None] | unknown, 0.0, known)
+    out = _separated(known, ~np.isfinite(np.diagonal(known)))
+    return _separated(out, ~np.isfinite(out).all(axis=1))
+
+
+def _separated(known: F64, unknown: Bools) -> F64:
+    """With MOST_NUMBER as the variance of these numbers."""
+    out = np.where(np.logical_or.outer(unknown, unknown), 0.0, known)
     out[unknown, unknown] = MOST_NUMBER
-    return out
+    return np.asarray(out, np.float64)
 
 
 def residuals_weighed(solver: Solver, ledger: Ledger, rows: I64) -> F64:
