@@ -75,8 +75,8 @@ def _known(solver: Solver, ends: I64, d: int) -> F64:
 def unsure_where_unknown(known: F64) -> F64:
     """Numbers whose covariance is beyond doubles, as next to what hardly holds a map, have a large one, and nothing in
     common with others: so what is between them can be expected by nobody, and waits."""
-    out = _separated(known, ~np.isfinite(np.diagonal(known)))
-    return _separated(out, ~np.isfinite(out).all(axis=1))
+    out = _separated(known, np.asarray(~np.isfinite(np.diagonal(known))))
+    return _separated(out, np.asarray(~np.isfinite(out).all(axis=1)))
 
 
 def _separated(known: F64, unknown: Bools) -> F64:

@@ -17,7 +17,7 @@ from factorbus.solver.kernels.bayes_tree.error_terms import turn_of
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, PLACE, move_variable, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.scratch import give_back, take, used
+from factorbus.solver.kernels.jit.scratch import free_since, scratch_used, take
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.jit.sorting import put_in_order
@@ -259,7 +259,7 @@ def move_bodies(graph: Graph, tree: Tree, listed: I64, quiet: float, delta: F64,
     n = 0
     for k in range(listed.size):
         n += clique[listed[k], tl.C_FRONTALS]
-    taken = used(tree.scratch)
+    taken = scratch_used(tree.scratch)
     variables = take(n, tree.scratch)
     n = 0
     for k in range(listed.size):
@@ -277,4 +277,4 @@ def move_bodies(graph: Graph, tree: Tree, listed: I64, quiet: float, delta: F64,
         move_variable(graph, tree, v, delta, lin, before)
         lever_error = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * load(motions, since + tl.M_TURN)
         note_moved(MODEL if lever_error > quiet else PLACE, v, node, moved, state)
-    give_back(taken, tree.scratch)
+    free_since(taken, tree.scratch)

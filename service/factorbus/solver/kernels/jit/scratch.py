@@ -18,14 +18,14 @@ def clear_scratch(scratch: I64) -> None:
 
 
 @inline_kernel
-def used(scratch: I64) -> int:
-    """How much of the room is used, for `give_back`."""
+def scratch_used(scratch: I64) -> int:
+    """How much of the room is used, for `free_since`."""
     return int(scratch[0])
 
 
 @inline_kernel
-def give_back(before: int, scratch: I64) -> None:
-    """What was taken since this much was `used` is not needed any more."""
+def free_since(before: int, scratch: I64) -> None:
+    """What was taken since this much was used is not needed any more."""
     scratch[0] = before
 
 
