@@ -52,7 +52,7 @@ def test_error_and_force_are_those_of_the_definition(world: str) -> None:
             continue  # an observation that lost its pixel or found it again
         dim = len(weight)
         model, force = r[:dim].copy(), 0.0
-        if graph.fac[f, at.F_KIND] == at.IMU:  # whose model is corrected where it is taken in off its point
+        if graph.fac[f, at.F_KIND] == at.IMU:  # whose model is corrected where it is added off its point
             k = jacobian_at(f, graph.var, graph.fac, tree.link)
             model = tree.hessian[k : k + dim].copy() if is_plain_imu(graph, f, weight) else model
         for end, v in enumerate(graph.ends_of(f)):

@@ -153,7 +153,7 @@ class Ledger:
         self.closures.extend(new)
 
     def make_room(self, more: int) -> None:
-        """For so many behind."""
+        """For `more` rows behind those in use."""
         if (need := self.count + more) > len(self.z):
             need = max(need, _ROOM)
             for name in _COLUMNS:

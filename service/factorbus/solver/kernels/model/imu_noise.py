@@ -67,7 +67,7 @@ def propagate_noise(z: F64, walk: Walk) -> F64:
     S, trace, w = np.zeros(SIZE * SIZE), walk.trace, walk.lanes
     p = w[P * LANES], w[(P + 1) * LANES], w[(P + 2) * LANES]
     v = w[V * LANES], w[(V + 1) * LANES], w[(V + 2) * LANES]
-    plain = drifts = spreads = steps = 0.0  # Σ s h, and what accelerometers and integration add
+    isotropic = drifts = spreads = steps = 0.0  # Σ s h, and what accelerometers and integration add
     for k in range(0, trace.size, T_WIDTH):
         left, h = load(trace, k + T_LEFT), load(trace, k + T_H)
         reach = left + 0.5 * h
@@ -78,13 +78,13 @@ def propagate_noise(z: F64, walk: Walk) -> F64:
         share, square = 2.0 * load(trace, k + T_B), u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
         # 1 − s is as small as θ² is.
         if square < SMALL_TURN:
-            bent = 1 / 12 - square * (1 / 360 - square * (1 / 20160 - square * (1 / 1814400 - square / 239500800)))
+            axial = 1 / 12 - square * (1 / 360 - square * (1 / 20160 - square * (1 / 1814400 - square / 239500800)))
         else:
-            bent = (1.0 - share) / square
-        plain += share * h
-        _add_sample(share * h, bent * h, c, d, u, S)
+            axial = (1.0 - share) / square
+        isotropic += share * h
+        _add_sample(share * h, axial * h, c, d, u, S)
     out, turned = np.zeros((SIZE, SIZE)), z[of.GYROSCOPE] * z[of.GYROSCOPE]
-    _turn_to_end(S, plain, turned, w, out)
+    _turn_to_end(S, isotropic, turned, w, out)
     pushed, integration = z[of.ACCELEROMETER] * z[of.ACCELEROMETER], z[of.INTEGRATION] * z[of.INTEGRATION]
     for a in range(3):
         out[3 + a, 3 + a] += pushed * spreads + integration * steps
@@ -117,11 +117,11 @@ def _cross(x: tuple, y: tuple) -> tuple:
 
 
 @inline_kernel
-def _add_sample(plain: float, bent: float, c: tuple, d: tuple, u: tuple, S: F64) -> None:
-    """S += D (s I + κ u uᵀ) Dᵀ on and below the diagonal, but for s I of the rotation; plain = s h, bent = κ h."""
+def _add_sample(isotropic: float, axial: float, c: tuple, d: tuple, u: tuple, S: F64) -> None:
+    """S += D (s I + κ u uᵀ) Dᵀ on and below the diagonal, but for s I of the rotation; isotropic = s h, axial = κ h."""
     e, f = _cross(u, c), _cross(u, d)
-    bu, be, bf = _times(bent, u), _times(bent, e), _times(bent, f)
-    pc, pd = _times(plain, c), _times(plain, d)
+    bu, be, bf = _times(axial, u), _times(axial, e), _times(axial, f)
+    pc, pd = _times(isotropic, c), _times(isotropic, d)
     cc, cd, dd = _dot(pc, c), _dot(pc, d), _dot(pd, d)
     _add(S, 0, bu[0] * u[0])
     _add(S, 9, bu[1] * u[0])
@@ -176,13 +176,13 @@ def _add_row(S: F64, k: int, x: float, y: tuple, more: tuple) -> None:
 
 
 @inline_kernel
-def _turn_to_end(S: F64, plain: float, scale: float, w: F64, out: F64) -> None:
+def _turn_to_end(S: F64, isotropic: float, scale: float, w: F64, out: F64) -> None:
     """The sum times `scale`, with the rotation as seen where the samples end: its rows and columns times R."""
     for a in range(SIZE):
         for c in range(a + 1):
             out[a, c] = scale * S[SIZE * a + c]
     for a in range(3):
-        out[a, a] += scale * plain
+        out[a, a] += scale * isotropic
         for c in range(a):
             out[c, a] = out[a, c]
     for a in range(SIZE):
