@@ -21,10 +21,8 @@ from factorbus.solver.kernels.model.factor_rows import is_one_of_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.many import chi2_of_many
 from factorbus.solver.kernels.model.records import Graph
-from factorbus.solver.kernels.model.se2 import wrap
+from factorbus.solver.kernels.model.se2 import SMALL_ANGLE, small_turn, wrap
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
-
-SMALL_ANGLE = 0.1  # radians: below it the series of sine and cosine are exact to rounding
 
 
 @inline_kernel
@@ -105,9 +103,7 @@ def heading_of(v: int, planar: bool, var: I64, delta: F64, values: F64, turns: F
     if not abs(angle) < SMALL_ANGLE:
         theta = load(values, var[v, at.V_AT] + 2)
         return math.cos(theta), math.sin(theta)
-    q = angle * angle
-    c = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q * (1.0 / 40320.0))))
-    s = angle * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0 - q * (1.0 / 362880.0)))))
+    c, s = small_turn(angle)
     c0, s0 = turns[v, tl.U_COS], turns[v, tl.U_SIN]
     return c * c0 - s * s0, s * c0 + c * s0
 

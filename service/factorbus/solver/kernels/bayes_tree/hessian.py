@@ -14,11 +14,12 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import Panel, put, six
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many
+from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, loss_code
 from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, multiply
 from factorbus.solver.kernels.model.many import linearize_kept, square_of, width_of
 from factorbus.solver.kernels.model.records import Graph
+from factorbus.solver.kernels.model.se2 import SMALL_ANGLE, small_turn, wrap
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
 
@@ -36,7 +37,13 @@ def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None
     kind, hessian, factor_errors, h = graph.fac[f, at.F_KIND], tree.hessian, tree.factor_errors, tree.link[f, tl.L_AT]
     if factor_errors[f, tl.E_FORM] >= tl.CORRECTED:
         factor_errors[f, tl.E_FORM] -= tl.CORRECTED
-    more = evaluate_apart(f, graph.var, graph.fac, tree.lin[0], graph.payload, scratch.r, scratch.H[0], scratch.H[1])
+    if kind == at.BETWEEN_SE2 and loss_code(f, graph.fac) == at.NO_LOSS:
+        more = 0.0
+        evaluate_between_se2(graph, tree, f, scratch)
+    else:
+        more = evaluate_apart(
+            f, graph.var, graph.fac, tree.lin[0], graph.payload, scratch.r, scratch.H[0], scratch.H[1]
+        )
     # Sizes as constants, so that each call becomes straight code.
     if kind == at.BETWEEN_SE2:
         _write(graph, tree, f, 3, 3, 3, more, scratch)
@@ -54,6 +61,33 @@ def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None
         _write_other(graph, tree, f, more, scratch)
         if is_camera(kind):
             note_inactive(f, scratch.r[at.R_STATUS] != GOOD, tree.link, tree.state)
+
+
+@inline_kernel
+def evaluate_between_se2(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
+    """`between_se2` at the linearization points, of which cosine and sine are known.
+
+    R_z = Rᵢᵀ Rⱼ R_rᵀ, r being the angle of the residual.
+    """
+    var, fac, p, x, turns = graph.var, graph.fac, graph.payload, tree.lin[0], tree.turns
+    r, A, B = scratch.r, scratch.H[0], scratch.H[1]
+    v, u, k = fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT]
+    i, j = var[v, at.V_AT], var[u, at.V_AT]
+    c, s, c1, s1 = turns[v, tl.U_COS], turns[v, tl.U_SIN], turns[u, tl.U_COS], turns[u, tl.U_SIN]
+    turn = wrap(x[j + 2] - x[i + 2] - p[k + 2])
+    cr, sr = small_turn(turn) if abs(turn) < SMALL_ANGLE else (math.cos(turn), math.sin(turn))
+    c1, s1 = c * c1 + s * s1, c * s1 - s * c1
+    cz, sz = c1 * cr + s1 * sr, s1 * cr - c1 * sr
+    tx, ty = x[j] - x[i], x[j + 1] - x[i + 1]
+    dx, dy = c * tx + s * ty, c * ty - s * tx
+    ex, ey = dx - p[k], dy - p[k + 1]
+    r[0], r[1], r[2] = cz * ex + sz * ey, cz * ey - sz * ex, turn
+    A[0, 0], A[0, 1], A[0, 2] = -cz, -sz, cz * dy - sz * dx
+    A[1, 0], A[1, 1], A[1, 2] = sz, -cz, -cz * dx - sz * dy
+    A[2, 0], A[2, 1], A[2, 2] = 0.0, 0.0, -1.0
+    B[0, 0], B[0, 1], B[0, 2] = cr, -sr, 0.0
+    B[1, 0], B[1, 1], B[1, 2] = sr, cr, 0.0
+    B[2, 0], B[2, 1], B[2, 2] = 0.0, 0.0, 1.0
 
 
 @part

@@ -10,6 +10,7 @@ import math
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel
 
 _TWO_PI = 2.0 * math.pi
+SMALL_ANGLE = 0.1  # radians: below it the series of sine and cosine are exact to rounding
 
 
 @inline_kernel
@@ -17,6 +18,15 @@ def wrap(angle: float) -> float:
     """The same angle in [−π, π); an angle that is there already keeps its bits."""
     wrapped = angle - _TWO_PI * math.floor((angle + math.pi) / _TWO_PI)
     return wrapped - _TWO_PI if wrapped >= math.pi else wrapped
+
+
+@inline_kernel
+def small_turn(angle: float) -> tuple[float, float]:
+    """Cosine and sine of an angle below SMALL_ANGLE, by series that are exact to rounding."""
+    q = angle * angle
+    c = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q * (1.0 / 40320.0))))
+    s = angle * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0 - q * (1.0 / 362880.0)))))
+    return c, s
 
 
 @inline_kernel
