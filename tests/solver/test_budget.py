@@ -198,7 +198,11 @@ def test_a_step_takes_no_more_than_its_budget_where_nothing_far_is_joined() -> N
 
 
 def test_a_chord_step_that_does_not_fit_is_not_begun() -> None:
-    """It solves all cliques from the factors that it corrects up to the root, whatever is left of the budget."""
+    """It solves all cliques from the factors that it corrects up to the root, whatever is left of the budget.
+
+    Behind it comes what back-substitution has in any case, an eighth of the nine tenths that are planned with, and what it
+    takes to look at those that wait.
+    """
     budget, shares = 1e7, []
     for seed in (7, 8):
         solver = Solver(Options(step_budget=budget))
@@ -207,7 +211,7 @@ def test_a_chord_step_that_does_not_fit_is_not_begun() -> None:
             report = solver.step()
             if "chord step" in report.because:
                 shares.append(report.work / budget)
-    assert 0.5 < max(shares) <= 1.02
+    assert 0.5 < max(shares) <= 1.1
 
 
 def test_what_is_left_is_a_bound_of_what_there_is_to_gain() -> None:
