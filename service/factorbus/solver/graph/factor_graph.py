@@ -54,6 +54,7 @@ _TRIANGLE = np.array(
     [*(FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)), *_NO_SIZE], np.int64
 )
 _NO_KEYS: I64 = np.empty(0, np.int64)
+_new = tuple.__new__
 
 
 class FactorGraph(Arenas):
@@ -280,11 +281,12 @@ class FactorGraph(Arenas):
     def _scattered(self, span: Span) -> Group:
         values, rows = np.empty((span.count, span.size)), span.rows()
         gather_values(rows, self.array_table, _NO_KEYS, values)
-        values.flags.writeable = not span.fixed  # as where they are together
+        if span.fixed:  # as where they are together
+            values.flags.writeable = False
         stamps = self.stamps_of(rows)
         if stamps is not None:
             stamps.flags.writeable = False
-        return Group(span.kind, span.keys_apart(self.keys), values, span.fixed, stamps)
+        return _new(Group, (span.kind, span.keys_apart(self.keys), values, span.fixed, stamps))
 
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]
