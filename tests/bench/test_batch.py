@@ -47,6 +47,8 @@ def missed(*rows: dict[str, Any]) -> list[str]:
 
 def test_bars() -> None:
     assert missed(row(OURS, 1.0), row(OURS_ALONE, 0.5), row(PEER, 3.5)) == []
+    assert missed(row(OURS, 2.0), row(OURS_ALONE, 0.5), row(PEER, 1.6)) == []  # that start is what they have, too
+    assert missed(row(OURS, 1.0), row(OURS_ALONE, 0.1, 11.0), row(PEER, 0.5)) == []  # from there it ends elsewhere
     assert missed(row(OURS, 1.0), row(PEER, 2.0)) == ["gtsam lm over ours, geometric mean of 1"]
     assert missed(row(OURS, 1.0), row("g2o gn", 0.9)) == ["a, file: faster than g2o gn"]
     assert missed(row(OURS, 1.0, 10.1), row("g2o gn", 2.0)) == ["a, file: lowest χ² to 1e-6"]
