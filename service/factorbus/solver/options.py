@@ -51,7 +51,7 @@ class Options:
     backend: Literal["blocks", "cholmod"] = "blocks"
     clock: Callable[[], float] | None = None
     relinearize_threshold: float = 5e-4
-    wildfire_threshold: float = 0.02
+    wildfire_threshold: float = 0.016
     converged_share: float = 5e-4
     max_rounds: int = 3
     step_budget: float = 0.0

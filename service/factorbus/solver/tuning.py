@@ -54,8 +54,8 @@ class Tuning:
     Raises BadOption: a value is no number of its range.
     """
 
-    relinearize_next_step_share: float = 3e-5
-    relinearize_same_step_share: float = 3e-5
+    relinearize_next_step_share: float = 1.5e-5
+    relinearize_same_step_share: float = 1.5e-5
     relinearize_max_error: float = 2.0
     relinearize_max_wait: int = 1000
     relinearize_full_batch: int = 1500
