@@ -14,8 +14,9 @@ from recordings import START_NS, Said
 from zenoh_ros_type.common_interfaces.geometry_msgs import Transform
 
 from factorbus.client import Draft, ImuNoise, cut_samples, initial_from_standstill
-from factorbus.client.frames import compose, inverse, rotation_of
+from factorbus.client.frames import compose, inverse
 from factorbus.proto.arrays import F64
+from factorbus.proto.linear_in_frame import rotation_of
 from factorbus.ros2.messages import IMU, ODOMETRY, TRANSFORMS
 from factorbus.simulate import inertial
 

@@ -5,7 +5,7 @@ import pytest
 
 from factorbus.client import Draft
 from factorbus.proto.components import COMPONENTS_LISTED, Component, Components, decode_components, encode_components
-from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.linear_in_frame import said_of_frame
 from factorbus.proto.messages import Batch, Factors, MapGraph, Variables
 from factorbus.proto.problems import BadMessage
 from factorbus.proto.symbols import format_symbol, symbol
@@ -59,20 +59,41 @@ def test_a_mount_and_a_bias_in_common_join_nothing() -> None:
     assert [each.held for each in found.listed] == [{"fixed": 1}] * 2, "the mount's prior holds no robot"
 
 
-def test_linear_factors_count_where_nothing_else_holds_it() -> None:
-    linear = FACTOR_KINDS["linear_3_se2"]
-    z = np.tile(np.array(linear.example), (1, 1))
-    draft = Draft().se2("a0", (0, 0, 0), fixed=True).se2("b0").batch()
-    rows = [Factors(linear.name, np.array([[key]]), z, np.ones((1, linear.information_size))) for key in keys("a0 b0")]
-    found = found_in(Batch(draft.variables, tuple(rows)))
-    assert [(each.held, each.own_frame) for each in found.listed] == [
-        ({"fixed": 1}, True),
-        ({"linear_3_se2": 1}, False),
-    ]
+@pytest.mark.parametrize(("kind", "pose"), [("se2", (1, 2, 0.5)), ("se3", (1, 2, 3, 0, 0, 0.6, 0.8))])
+def test_what_a_linear_factor_says_of_the_frame_is_in_its_numbers(kind: str, pose: tuple[float, ...]) -> None:
+    """With H of a prior on one pose it holds its part, beside all else; with H of a relative pose it does not."""
+    dim = 3 if kind == "se2" else 6
+    draft = Draft().variable(kind, "a0", pose, fixed=True).variable(kind, "a1", pose)
+    draft.variable(kind, "b0", pose).variable(kind, "b1", pose)
+    sigmas, nothing = [0.1] * dim, [0.0] * dim
+    draft.linear(["a0", "a1"], [pose, pose], [-np.eye(dim), np.eye(dim)], nothing, sigmas=sigmas)
+    draft.linear(["b0", "b1"], [pose, pose], [np.zeros((dim, dim)), np.eye(dim)], nothing, sigmas=sigmas)
+    found = found_in(draft)
+    name = f"linear_{dim}_{kind}_{kind}"
+    assert [(each.held, each.own_frame) for each in found.listed] == [({"fixed": 1}, True), ({name: 1}, False)]
+    draft.linear(["a1"], [pose], [np.eye(dim)], nothing, sigmas=sigmas)
+    found = found_in(draft)
+    assert (found.listed[0].held, found.listed[0].own_frame) == ({"fixed": 1, f"linear_{dim}_{kind}": 1}, False)
 
 
-def keys(names: str) -> list[int]:
-    return [symbol(name[0], int(name[1:])) for name in names.split()]
+@pytest.mark.parametrize(
+    ("H", "place"),
+    [
+        (np.eye(6)[3:5], False),  # roll and pitch: which way is up
+        (np.eye(6)[3:], True),  # all of the rotation
+        (np.eye(6)[:1], True),  # one coordinate, far from the origin: a lever of 10⁶ m turns it as well
+        (np.eye(6)[2:5], True),  # a height too
+    ],
+)
+def test_which_way_is_up_is_no_place(H: np.ndarray, place: bool) -> None:
+    pose = (5e6, 4e5, 100, 0, 0, 0, 1)
+    draft = Draft().se3("a0", pose).linear(["a0"], [pose], [H], np.zeros(len(H)), sigmas=[0.1] * len(H))
+    group = draft.batch().factors[0]
+    said = said_of_frame(group, [[""]])
+    assert (said.anything.tolist(), said.place.tolist()) == ([True], [place])
+    assert bool(found_in(draft).listed[0].held) is place
+    alone = said_of_frame(group, [["mount"]])
+    assert not alone.anything.any(), "a mount moves with no frame"
 
 
 def test_an_empty_map_has_none() -> None:

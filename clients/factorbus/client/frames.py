@@ -8,6 +8,7 @@ import numpy as np
 
 from factorbus.proto.arrays import F64
 from factorbus.proto.kinds import VARIABLE_KINDS
+from factorbus.proto.linear_in_frame import rotation_of
 from factorbus.proto.roles import AXES, FRAME, MOUNT
 
 # Numbers of a pose, by the space that a kind of variable is in.
@@ -28,21 +29,6 @@ def inverse(T_a_b: F64) -> F64:
     if T_a_b.size == 3:
         return np.array([*(-rotation_of(T_a_b).T @ T_a_b[:2]), -T_a_b[2]])
     return np.array([*(-rotation_of(T_a_b).T @ T_a_b[:3]), *-T_a_b[3:6], T_a_b[6]])
-
-
-def rotation_of(pose: F64) -> F64:
-    """R of a pose, (2, 2) or (3, 3)."""
-    if pose.size == 3:
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        return np.array([[c, -s], [s, c]])
-    x, y, z, w = pose[3:] / np.linalg.norm(pose[3:])
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def matrix_of_pose(pose: F64) -> F64:

@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import all_finite, as_numbers, checked_bound, checked_number, checked_row, of_type, seen
 from factorbus.client.certainty import Certainty
-from factorbus.client.frames import rotation_of
 from factorbus.client.imu_samples import refuse_gaps, refuse_not_finite, warn_implausible
 from factorbus.client.key_numbers import Key, key_numbers
 from factorbus.proto.arrays import F64
 from factorbus.proto.inertial import BIAS, MOST_SAMPLES, RESIDUAL, SAMPLE, ImuForm
+from factorbus.proto.linear_in_frame import rotation_of
 from factorbus.proto.problems import BadOption, BadShape
 from factorbus.proto.symbols import format_symbol
 

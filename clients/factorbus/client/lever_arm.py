@@ -21,8 +21,9 @@ of a degree and a lever of a metre 0.15 mm.  MATH §3.7.
 
 import numpy as np
 
-from factorbus.client.frames import compose, inverse, rotation_of
+from factorbus.client.frames import compose, inverse
 from factorbus.proto.arrays import F64
+from factorbus.proto.linear_in_frame import rotation_of
 from factorbus.proto.problems import BadShape
 
 # How far a quaternion may be from unit length, as the service has it.

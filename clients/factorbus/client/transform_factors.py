@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from factorbus.client.frames import rotation_of
 from factorbus.client.roles import Roles
 from factorbus.client.transform_linear import transform_linear
 from factorbus.proto.arrays import F64
 from factorbus.proto.inertial import GRAVITY
 from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.linear_in_frame import rotation_of
 from factorbus.proto.messages import Factors
 
 

@@ -10,8 +10,8 @@ no correction.  So what is blended is map → first odometry, in which it is lef
 import numpy as np
 
 from factorbus.client.blending import PoseBlend
-from factorbus.client.frames import rotation_of
 from factorbus.proto.arrays import F64
+from factorbus.proto.linear_in_frame import rotation_of
 from factorbus.ros2.geometry import Transform, quaternion
 from factorbus.ros2.track import Correction
 

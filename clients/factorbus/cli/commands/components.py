@@ -24,7 +24,8 @@ def components_command(address: MapAddress, as_json: bool) -> int:
 
     A part in a frame of its own is held by one fixed pose or one prior of a pose, and nothing says how it lies to the
     others: `factorbus change attach` brings it into the frame of the rest. Parts that are held by more, such as GNSS,
-    are in one frame without a factor between them.
+    are in one frame without a factor between them. A linear factor, which marginalizing leaves, is among what holds a
+    part where its numbers say where in the map's frame that is; between the poses of a part it does not.
 
     \b
     factorbus ask components warehouse

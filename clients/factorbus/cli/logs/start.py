@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.cli.logs.sensor_log import SensorLog
-from factorbus.client.frames import compose, inverse, rotation_of
+from factorbus.client.frames import compose, inverse
 from factorbus.client.imu import initial_from_standstill
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.linear_in_frame import rotation_of
 from factorbus.proto.problems import BadOption, BadShape
 
 _EXACT, _MOVING, _GYROSCOPE, _ACCELEROMETER = 1e-3, 1.0, 0.01, 0.2

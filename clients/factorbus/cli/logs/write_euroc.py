@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from factorbus.client.frames import rotation_of
 from factorbus.client.geodetic import geodetic
 from factorbus.proto.arrays import F64
+from factorbus.proto.linear_in_frame import rotation_of
 from factorbus.simulate.inertial import InertialWorld
 
 ORIGIN = (48.1, 11.6, 520.0)

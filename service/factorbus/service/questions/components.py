@@ -1,14 +1,15 @@
 """Which parts of a map no factor joins, and what holds each: found from a copy of the map when somebody asks."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from factorbus.proto.arrays import I64
 from factorbus.proto.components import COMPONENTS_LISTED, Component, Components
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, name_of_kind
+from factorbus.proto.linear_in_frame import said_of_frame
 from factorbus.proto.messages import Batch, Factors, MapGraph
-from factorbus.proto.roles import keys_in_no_frame
+from factorbus.proto.roles import AXES, FRAME, MOUNT, keys_in_no_frame, keys_of_role
 from factorbus.proto.symbols import symbol_parts
 
 _NONE = np.empty(0, np.int64)
@@ -73,33 +74,41 @@ def _labels(size: int, rows: Sequence[I64]) -> tuple[int, I64]:
 def _held(
     batch: Batch, keys: I64, rows: Sequence[I64], component: I64, count: int
 ) -> tuple[I64, list[dict[str, int]], list[bool]]:
-    """Of each component: its factors, what says where it is in the map's frame, whether that is one gauge alone.
-
-    Linear factors are counted where nothing else holds it: what they say of a frame is in their numbers.
-    """
+    """Of each component: its factors, what says where it is in the map's frame, whether that is one gauge alone."""
     factors, held = np.zeros(count, np.int64), [dict[str, int]() for _ in range(count)]
-    poses, linear = np.zeros(count, np.int64), list[tuple[str, I64]]()
+    poses = np.zeros(count, np.int64)
     for group in batch.variables:
         if group.fixed:
             chosen = component[np.searchsorted(keys, group.keys[np.isin(group.keys, keys)])]
             _count("fixed", chosen, held)
             if VARIABLE_KINDS[group.kind].is_pose:
                 poses += np.bincount(chosen, minlength=count)
+    roles = {role: keys_of_role(batch, role) for role in (MOUNT, FRAME, AXES)}
     for group, ends in zip(batch.factors, rows, strict=True):
         anchor = ends.max(axis=1, initial=-1)
-        chosen = component[anchor[anchor >= 0]]
-        factors += np.bincount(chosen, minlength=count)
-        kind = FACTOR_KINDS[group.kind]
-        if kind.is_linear:
-            linear.append((name_of_kind(group.kind), chosen))
-        elif kind.is_absolute:
-            _count(name_of_kind(group.kind), chosen, held)
-            if group.kind in _PRIORS:
-                poses += np.bincount(chosen, minlength=count)
-    bare = np.array([not each for each in held], bool)
-    for name, chosen in linear:
-        _count(name, chosen[bare[chosen]], held)
-    return factors, held, [sum(each.values()) == 1 == poses[n] for n, each in enumerate(held)]
+        factors += np.bincount(component[anchor[anchor >= 0]], minlength=count)
+        _count(name_of_kind(group.kind), component[anchor[(anchor >= 0) & _say_where(group, roles)]], held)
+        if group.kind in _PRIORS:
+            poses += np.bincount(component[anchor[anchor >= 0]], minlength=count)
+    return factors, held, [sum(each.values()) == 1 and bool(poses[n] == 1) for n, each in enumerate(held)]
+
+
+def _say_where(group: Factors, roles: Mapping[str, I64]) -> np.ndarray:
+    """(m,): which factors say where their variables are in the map's frame.
+
+    What a linear factor says is in its numbers.  Which way is up is no place: a part that only knows that, as of an
+    IMU, is in a frame of its own.
+    """
+    kind = FACTOR_KINDS[group.kind]
+    if not kind.is_linear:
+        return np.full(len(group.keys), kind.is_absolute)
+    ends = []
+    for end in group.keys.T:
+        names = np.full(len(end), "", "U8")
+        for role, of_role in roles.items():
+            names[np.isin(end, of_role)] = role
+        ends.append(names.tolist())
+    return said_of_frame(group, ends).place
 
 
 def _count(name: str, chosen: I64, held: list[dict[str, int]]) -> None:

@@ -2,7 +2,10 @@
 
 Variables that hang together go together.  Those that they share a factor with are their separator, and what they say of
 it is one linear factor there, linearized at the estimate; or a prior, of a single point that it determines.  Refused is
-a separator of more than MOST_JOINED variables.
+a separator of more than MOST_JOINED free variables.
+
+Fixed poses are in it too, where there is room: so what hung on one through a pose that goes still hangs on it, in its
+frame, and stays right where it is freed, or moved with the part that it holds.
 """
 
 import numpy as np
@@ -15,6 +18,7 @@ from factorbus.solver.graph.groups import FactorGroup
 from factorbus.solver.graph.whitened import Whitened, kind_of, whitened
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import POSE
 
 # Of the square root of what is known: a scalar of which no more than this is left beside what goes is not known at all,
 # nor is a direction, in columns of length 1, beside the best known one.  Λ in doubles has no more, and Jacobians of a
@@ -31,8 +35,8 @@ def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[Fac
     used: list[int] = []
     for part, rows in _components(graph, gone, kept):
         used += rows
-        _check_separator(graph, part or gone[:1].tolist(), rows, gone)
-        whole = whitened(graph, rows, part)
+        fixed = _separator_of(graph, part or gone[:1].tolist(), rows, gone)
+        whole = whitened(graph, rows, part, fixed)
         separator = whole.variables[len(part) :]
         if separator:
             made += _as_factors(graph, separator, *reduced(graph, whole, len(part)))
@@ -70,12 +74,17 @@ def _components(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[l
     return [(variables.get(head, []), sorted(factors.get(head, []))) for head in heads]
 
 
-def _check_separator(graph: FactorGraph, part: list[int], rows: list[int], gone: I64) -> None:
-    """Before anything is computed of it.  Raises TooConnected."""
+def _separator_of(graph: FactorGraph, part: list[int], rows: list[int], gone: I64) -> set[int]:
+    """The fixed poses in the separator, before anything is computed of it; none where there are too many.
+
+    Raises TooConnected.
+    """
     ends = np.setdiff1d([v for row in rows for v in graph.ends_of(row)], gone).astype(np.int64)
-    separator = ends[graph.var[ends, at.V_COLUMN] >= 0]
+    free = graph.var[ends, at.V_COLUMN] >= 0
+    separator, poses = ends[free], [v for v in ends[~free].tolist() if POSE[graph.var[v, at.V_KIND]]]
     if separator.size > MOST_JOINED:
         raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[separator].tolist(), MOST_JOINED)
+    return set(poses) if separator.size and separator.size + len(poses) <= MOST_JOINED else set()
 
 
 def reduced(graph: FactorGraph, whole: Whitened, count: int) -> tuple[F64, F64]:

@@ -1,6 +1,6 @@
 """What some factors say of their variables together, to second order at the estimate: dense, for a few of them."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from factorbus.solver.kernels.model.candidates import evaluate_factors
 
 @dataclass(frozen=True, slots=True)
 class Whitened:
-    """χ² of some factors is |J δ + r|², x ⊟ y around the estimate, over free variables in this order.
+    """χ² of some factors is |J δ + r|², x ⊟ y around the estimate, over variables in this order.
 
     starts: where each begins in δ   J (m, n), r (m,): times Ω^½, and √w of a loss
     """
@@ -37,11 +37,13 @@ class Whitened:
         return -self.J.T @ self.r
 
 
-def whitened(graph: FactorGraph, rows: Iterable[int], first: list[int]) -> Whitened:
-    """Of the factors `rows`; the variables `first` come first, behind them the others on these factors, ascending."""
+def whitened(graph: FactorGraph, rows: Iterable[int], first: list[int], fixed: Collection[int] = ()) -> Whitened:
+    """Of the factors `rows`; the variables `first` come first, behind them the others on these factors, ascending: those
+    that are free, and of fixed ones those in `fixed`."""
     rows = list(rows)
     ends = {v for row in rows for v in graph.ends_of(row)} - set(first)
-    variables, starts, size = [*first, *sorted(v for v in ends if graph.var[v, at.V_COLUMN] >= 0)], {}, 0
+    variables = [*first, *sorted(v for v in ends if graph.var[v, at.V_COLUMN] >= 0 or v in fixed)]
+    starts, size = {}, 0
     for v in variables:
         starts[v], size = size, size + kind_of(graph, v).dim
     picked = np.array(rows, np.int64)
