@@ -18,6 +18,7 @@ from factorbus.simulate import (
     Step,
     TreeSensor,
     city_trees,
+    inertial,
     manhattan,
     sphere,
 )
@@ -238,3 +239,12 @@ def test_parameters_are_checked_before_the_first_step(world, parameters: dict, w
         world(**parameters)
     assert words in str(caught.value)
     assert caught.value.code == "bad_parameter"
+
+
+@pytest.mark.parametrize("poses", [2, 3, 7, 60])
+def test_every_world_has_the_poses_asked_for(poses: int) -> None:
+    for name, world in WORLDS.items():
+        assert sum(1 for _ in world(poses=poses, seed=1)) == poses, name
+    made = inertial(poses, 1)
+    assert len(made.odometry) == poses, "an image for each"
+    assert made.imu[-1, 0] == made.odometry[-1, 0], "and nothing behind the last"

@@ -78,7 +78,7 @@ class FullDrive(NamedTuple):
 
 def full_drive(seconds: int = 200, seed: int = 1) -> FullDrive:
     """The course closes after 157 s: from then on it is driven again."""
-    world, random = inertial(2 * seconds, seed), np.random.default_rng([seed, 10])
+    world, random = inertial(2 * seconds + 1, seed), np.random.default_rng([seed, 10])
     imu = world.imu.copy()
     turn = inverse(np.array([0.0, 0.0, 0.0, *MOUNT[3:]]))
     for columns in (slice(1, 4), slice(4, 7)):

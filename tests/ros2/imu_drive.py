@@ -41,7 +41,7 @@ class ImuDrive(NamedTuple):
 
 
 def imu_drive(poses: int = 24, seed: int = 1) -> ImuDrive:
-    world = inertial(poses, seed)
+    world = inertial(poses + 1, seed)
     R = rotation_of(MOUNT)
     imu = world.imu.copy()
     imu[:, 1:4], imu[:, 4:] = imu[:, 1:4] @ R, imu[:, 4:] @ R

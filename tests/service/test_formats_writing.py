@@ -196,7 +196,9 @@ def test_losses_and_antennas_beside_the_pose_are_left_out_and_said() -> None:
     written = as_g2o(Batch(batch.variables, (robust, observation, antenna)))
     assert written.text == g2o_text(batch)
     assert written.left_out == {"between_se2 loss": 1, "position_se2": 1}
-    assert written.notes[0] == "1 between_se2 loss left out: g2o has no losses: written without their huber"
+    assert written.notes[0] == (
+        "1 between_se2 loss left out: g2o has no losses: the factors are written without their huber"
+    )
     keys, measured = np.repeat(edge.keys, 2, 0), np.repeat(edge.measured, 2, 0)
     twice = Factors(edge.kind, keys, measured, np.repeat(edge.information, 2, 0), "huber", np.ones(2))
     assert as_g2o(Batch(batch.variables, (twice, observation))).notes[0].startswith("2 between_se2 losses left out: ")
@@ -226,7 +228,7 @@ def test_what_is_left_out_of_several_groups_is_said_once_for_the_file() -> None:
     assert written.notes == (
         "2 time stamps left out: g2o has no record for the time of se3 variables",
         "2 idp left out: g2o has no record for such variables",
-        "3 between_se3 losses left out: g2o has no losses: written without their huber",
+        "3 between_se3 losses left out: g2o has no losses: the factors are written without their huber",
         "2 variables left out: neither a value nor an edge tells of x2, x3",
     )
     assert written.left_out == {"time stamps": 2, "idp": 2, "between_se3 loss": 3, "variables": 2}

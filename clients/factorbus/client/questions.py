@@ -1,14 +1,14 @@
 """Questions to a map: each method sends one and returns the future of its answer."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple, TypeVar
 
 from factorbus.client.arguments import checked_flag, checked_probability, checked_seconds, of_type
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
-from factorbus.proto import codec, keys
+from factorbus.proto import codec, fields, keys
 from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.closures import AskSuspects, Suspects, decode_suspects, encode_ask_suspects
 from factorbus.proto.components import Components, decode_components
@@ -24,10 +24,15 @@ log = logging.getLogger("factorbus.client")
 
 
 class Exported(NamedTuple):
-    """A map as the text of a file.  notes: what g2o has no record for and was left out, for people."""
+    """A map as the text of a file.
+
+    notes: what the format has no record for and was left out, or says less there, for people.  left_out: how many of
+    each kind those are; None: the service is an older one, which does not say.
+    """
 
     text: str
     notes: tuple[str, ...]
+    left_out: Mapping[str, int] | None = None
 
 
 class Questions:
@@ -116,4 +121,7 @@ def _exported(data: bytes) -> Exported:
         raise BadMessage("export.text", "missing or not a string", "a string")
     if not (isinstance(notes, list) and all(isinstance(note, str) for note in notes)):
         raise BadMessage("export.notes", "not strings", "an array of strings")
-    return Exported(text, tuple(notes))
+    if "left_out" not in content:
+        return Exported(text, tuple(notes))
+    counts = fields.mapping("export", content, "left_out")
+    return Exported(text, tuple(notes), {str(name): fields.integer("export.left_out", counts, name) for name in counts})

@@ -68,7 +68,7 @@ def inertial(poses: int = 200, seed: int = 1) -> InertialWorld:
     yaw, bias = rng.uniform(-np.pi, np.pi), rng.normal(0, errors.bias)
     frame = np.array([*rng.normal(0, 50, 3), 0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
     lever, mount = rng.normal(0, errors.lever), _turned(errors.camera, rng.normal(0, errors.mount))
-    rates, truth, velocity = _drive(int(poses * _HZ / _ODOMETRY_HZ) + 1, rng.uniform(0, 2 * np.pi, 4))
+    rates, truth, velocity = _drive((poses - 1) * (_HZ // _ODOMETRY_HZ) + 1, rng.uniform(0, 2 * np.pi, 4))
     h, n = 1.0 / _HZ, len(rates)
     walk = np.repeat([errors.gyroscope_walk, errors.accelerometer_walk], 3) * np.sqrt(h)
     drift = bias + np.vstack([np.zeros(6), np.cumsum(rng.normal(0, walk, (n - 1, 6)), axis=0)])

@@ -1,6 +1,6 @@
 """What linear factors say of where their variables are in the frame of the map: their numbers tell.
 
-A small motion of the whole frame, ξ = (translation, rotation), moves x_n ⊟ y_n by G_n ξ, and so the residual by M ξ with
+A small motion of the whole frame, ξ = (translation, rotation), moves x_n ⊟ y_n by G_n ξ, and so the residual by M ξ,
 M = Σ H_n G_n.  Where M is zero the factor is relative: it says the same wherever its variables are together.
 """
 

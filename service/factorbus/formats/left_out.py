@@ -1,5 +1,7 @@
 """What of a file, or of a graph, is left out: counted, said, and refused where nothing may be."""
 
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +11,23 @@ from factorbus.proto.arrays import I64
 from factorbus.wording import counted
 
 _SHOWN = 5
+
+
+class Notes(tuple[str, ...]):
+    """What was left out of a file, a sentence for each reason, for people; counts: the same by name, for programs."""
+
+    counts: dict[str, int]
+
+    def __new__(cls, notes: Iterable[str] = (), counts: Mapping[str, int] | None = None) -> "Notes":
+        made = super().__new__(cls, notes)
+        made.counts = dict(counts or {})
+        return made
+
+    def and_those(self, more: "Notes") -> "Notes":
+        """Of two files, or of two looks at one: counts add up."""
+        return Notes((*self, *more), Counter(self.counts) + Counter(more.counts))
+
+
 # Names that are nouns have a singular; names of records and kinds do not.
 _ONE = {
     "vertices": "vertex", "poses": "pose", "points": "point", "landmarks": "landmark", "variables": "variable",
@@ -59,6 +78,18 @@ class LeftOut:
         if count:
             self.counts[name] = self.counts.get(name, 0) + count
             self.notes.append(f"{_counted(count, name)} that a replay leaves out: {why}")
+
+    def change(self, name: str, count: int, into: str, why: str) -> None:
+        """Note what stays in the file, but says less there: written as `into`.  Raises FormatError when strict."""
+        if count and self.strict:
+            raise self._refused(count, name, why)
+        if count:
+            self.counts[name] = self.counts.get(name, 0) + count
+            self.notes.append(f"{_counted(count, name)} written {into}: {why}")
+
+    def told(self) -> Notes:
+        """All of it."""
+        return Notes(self.notes, self.counts)
 
     def say(self, note: str) -> None:
         """Nothing is left out, but somebody may want to know."""

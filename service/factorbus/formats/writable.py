@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.formats.errors import FormatError
-from factorbus.formats.left_out import LeftOut, shown
+from factorbus.formats.left_out import LeftOut, Notes, shown
 from factorbus.formats.weights import has_covariance
 from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS, name_of_kind
@@ -16,8 +16,9 @@ from factorbus.proto.roles import FRAME, MOUNT, keys_of_role, pick_factors, pick
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
-# How many of what are left out, by name and reason.  A kind may come in several groups: each is said once for the file.
-_Lost = Counter[tuple[str, str]]
+# How many of what are left out, by name and reason, or written as something less (`into`).
+# A kind may come in several groups: each is said once for the file.
+_Lost = Counter[tuple[str, str, str]]
 # Poses that are no places in the map: their role, what they are called, and what there is no record for.
 _ASIDE = ((MOUNT, "mounts", "where a sensor is on a robot"), (FRAME, "frames", "where the map is in another frame"))
 
@@ -26,16 +27,21 @@ _NO_COVARIANCE = "the information matrix has no inverse within what a double hol
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """The text of a file; notes: what was left out of it, for people; left_out: the same, counted by kind."""
+    """The text of a file; notes: what was left out of it."""
 
     text: str
-    notes: tuple[str, ...]
-    left_out: dict[str, int]
+    notes: Notes
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """How much of each name that is."""
+        return self.notes.counts
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A form of file: its name, the kinds of variables it has, and of factors with how many numbers are measured.
+    """A form of file: its name for people, the kinds of variables it has, and of factors with how many numbers are
+    measured.
 
     timed: the kinds of variables whose time it has.  fixes: whether it says which variables are fixed.
     covariances: whether it has covariances in place of information matrices.
@@ -60,20 +66,23 @@ def writable(batch: Batch, form: Form, left: LeftOut) -> Batch:
         if group.kind in form.variables:
             variables.append(group)
         else:
-            lost[group.kind, f"{form.name} has no record for such variables"] += len(group.keys)
+            lost[group.kind, f"{form.name} has no record for such variables", ""] += len(group.keys)
         if group.kind not in form.timed:
             stamps = 0 if group.stamps is None else int((group.stamps != NO_STAMP).sum())
-            lost["time stamps", f"{form.name} has no record for the time of {group.kind} variables"] += stamps
+            lost["time stamps", f"{form.name} has no record for the time of {group.kind} variables", ""] += stamps
         if group.fixed and not form.fixes:
-            lost["fixed variables", f"{form.name} has no record for them: written as free"] += len(group.keys)
+            lost["fixed variables", f"{form.name} does not say which variables are fixed", "as free"] += len(group.keys)
     gone = np.concatenate(
         [np.empty(0, np.int64), *(group.keys for group in batch.variables if group.kind not in form.variables)]
     )
     factors = [kept for group in batch.factors if (kept := _writable_factors(group, gone, form, lost)) is not None]
     named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in factors)])
     told = tuple(_with_values(variables, named, lost))
-    for (name, why), count in lost.items():
-        left.drop(name, count, why)
+    for (name, why, into), count in lost.items():
+        if into:
+            left.change(name, count, into, why)
+        else:
+            left.drop(name, count, why)
     return Batch(told, tuple(factors))
 
 
@@ -84,19 +93,19 @@ def number_text(numbers: Iterable[float]) -> str:
 
 def _writable_factors(group: Factors, gone: I64, form: Form, lost: _Lost) -> Factors | None:
     if group.kind not in form.measured or np.isin(group.keys, gone).any():
-        lost[name_of_kind(group.kind), _no_record(form)] += len(group.keys)
+        lost[name_of_kind(group.kind), _no_record(form), ""] += len(group.keys)
         return None
     kept = np.ones(len(group.keys), bool)
     if group.kind in ("position_se2", "position_se3"):
         kept = (group.measured[:, form.measured[group.kind] :] == 0.0).all(axis=1)
-        lost[group.kind, f"{form.name} has no record for an antenna beside its pose"] += int((~kept).sum())
+        lost[group.kind, f"{form.name} has no record for an antenna beside its pose", ""] += int((~kept).sum())
     if form.covariances:
         certain = has_covariance(group.information, FACTOR_KINDS[group.kind].dim)
-        lost[group.kind, _NO_COVARIANCE] += int((kept & ~certain).sum())
+        lost[group.kind, _NO_COVARIANCE, ""] += int((kept & ~certain).sum())
         kept = kept & certain
     if group.loss:
-        why = f"{form.name} has no losses: written without their {group.loss}"
-        lost[f"{group.kind} loss", why] += len(group.keys)
+        why = f"{form.name} has no losses: the factors are written without their {group.loss}"
+        lost[f"{group.kind} loss", why, ""] += len(group.keys)
     if not kept.any():
         return None
     return Factors(group.kind, group.keys[kept], group.measured[kept], group.information[kept])
@@ -116,13 +125,13 @@ def _without(batch: Batch, aside: I64, form: Form, name: str, why: str, lost: _L
     variables, factors = [], []
     for group in batch.variables:
         stays = ~np.isin(group.keys, aside)
-        lost[name, why] += int((~stays).sum())
+        lost[name, why, ""] += int((~stays).sum())
         if stays.any():
             variables.append(pick_variables(group, stays))
     for group in batch.factors:
         stays = np.asarray(~np.isin(group.keys, aside).any(axis=1))
         known = group.kind in form.measured
-        lost[group.kind, why if known else _no_record(form)] += int((~stays).sum())
+        lost[name_of_kind(group.kind), why if known else _no_record(form), ""] += int((~stays).sum())
         if stays.any():
             factors.append(pick_factors(group, stays))
     return Batch(tuple(variables), tuple(factors))
@@ -139,7 +148,7 @@ def _with_values(variables: list[Variables], named: I64, lost: _Lost) -> Iterato
         elif told.any():
             stamps = None if group.stamps is None else group.stamps[told]
             yield group._replace(keys=group.keys[told], stamps=stamps)
-    lost["variables", f"neither a value nor an edge tells of {shown(untold)}"] += len(untold)
+    lost["variables", f"neither a value nor an edge tells of {shown(untold)}", ""] += len(untold)
 
 
 def _refuse_unknown(batch: Batch, form: str) -> None:

@@ -6,7 +6,7 @@ from typing import TextIO
 
 import numpy as np
 
-from factorbus.formats.left_out import LeftOut
+from factorbus.formats.left_out import LeftOut, Notes
 from factorbus.formats.numbering import numbered
 from factorbus.formats.records import G2O, Edge
 from factorbus.formats.whole_file import write_whole
@@ -26,7 +26,7 @@ _FORM = Form("g2o", frozenset(_VERTEX_NAMES), {kind: record.measured for kind, (
 
 def write_g2o(
     path_or_file: str | os.PathLike[str] | TextIO, batch: Batch, strict: bool = False, ids: str = "auto"
-) -> tuple[str, ...]:
+) -> Notes:
     """Write `batch` to a path or an open text file, as `as_g2o` makes it; returns its notes.  Raises FormatError."""
     written = as_g2o(batch, strict, ids)
     if isinstance(path_or_file, str | os.PathLike):
@@ -53,7 +53,7 @@ def as_g2o(batch: Batch, strict: bool = False, ids: str = "auto") -> Written:
     kept = writable(batch, _FORM, left)
     keys, names = numbered(kept, ids, left)
     text = "\n".join([*_lines(kept, keys, names), ""])
-    return Written(text, tuple(left.notes), dict(left.counts))
+    return Written(text, left.told())
 
 
 def _lines(batch: Batch, keys: I64, ids: I64) -> Iterator[str]:

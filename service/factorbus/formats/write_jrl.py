@@ -18,7 +18,7 @@ from factorbus.formats.bearing_ranges import bearings_of_positions
 from factorbus.formats.cbor import as_cbor
 from factorbus.formats.errors import FormatError
 from factorbus.formats.jrl import BEARING_RANGE_3D, FACTORS, GTSAM_ORDER, JRL, VALUES, as_measured, as_value
-from factorbus.formats.left_out import LeftOut
+from factorbus.formats.left_out import LeftOut, Notes
 from factorbus.formats.outlier_labels import OUTLIERS, POTENTIAL_OUTLIERS
 from factorbus.formats.robot_log import RobotLog, first_mentions
 from factorbus.formats.weights import doubled_rotations, inverted_weights, unpacked_symmetric
@@ -32,7 +32,7 @@ from factorbus.proto.symbols import symbol_parts
 _VALUE_NAMES = {kind: name for name, kind in VALUES.items()}
 _FACTOR_NAMES = {kind: name for name, kind in FACTORS.items()}
 _FORM = Form(
-    JRL,
+    "JRL (.jrl, .jrl.cbor)",
     frozenset(_VALUE_NAMES),
     {kind: FACTOR_KINDS[kind].size for kind in _FACTOR_NAMES},
     frozenset(_VALUE_NAMES),
@@ -56,9 +56,7 @@ class _Measurement:
     outlier: bool = False
 
 
-def write_jrl(
-    path: str | os.PathLike[str], batch: Batch, strict: bool = False, log: RobotLog | None = None
-) -> tuple[str, ...]:
+def write_jrl(path: str | os.PathLike[str], batch: Batch, strict: bool = False, log: RobotLog | None = None) -> Notes:
     """Write `batch` to a path, as `as_jrl` makes it, in CBOR for .cbor; returns its notes.  Raises FormatError."""
     left = LeftOut(JRL, strict)
     document = _document(batch, log, Path(path).stem.removesuffix(f".{JRL}"), left)
@@ -66,7 +64,7 @@ def write_jrl(
         write_whole(path, as_cbor(document))
     else:
         write_whole(path, _text(document), encoding="ascii")
-    return tuple(left.notes)
+    return left.told()
 
 
 def recoded(text: str) -> bytes:
@@ -85,7 +83,7 @@ def as_jrl(batch: Batch, strict: bool = False, log: RobotLog | None = None, name
     """
     left = LeftOut(JRL, strict)
     text = _text(_document(batch, log, name, left))
-    return Written(text, tuple(left.notes), dict(left.counts))
+    return Written(text, left.told())
 
 
 def _document(batch: Batch, log: RobotLog | None, name: str, left: LeftOut) -> dict[str, Any]:

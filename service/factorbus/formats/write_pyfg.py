@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from factorbus.formats.left_out import LeftOut
+from factorbus.formats.left_out import LeftOut, Notes
 from factorbus.formats.pyfg import FACTORS, PYFG, RANGE, RANGES, VERTICES
 from factorbus.formats.seconds import seconds_text
 from factorbus.formats.weights import doubled_rotations, inverted_weights
@@ -24,7 +24,7 @@ from factorbus.wording import counted
 _VERTEX_NAMES = {record.kind: name for name, record in VERTICES.items()}
 _FACTOR_NAMES = {record.kind: name for name, record in FACTORS.items()} | dict.fromkeys(RANGES.values(), RANGE)
 _FORM = Form(
-    PYFG,
+    "PyFactorGraph (.pyfg)",
     frozenset(_VERTEX_NAMES),
     {kind: FACTOR_KINDS[kind].size for kind in _FACTOR_NAMES},
     frozenset(record.kind for record in VERTICES.values() if record.timed),
@@ -33,7 +33,7 @@ _FORM = Form(
 )
 
 
-def write_pyfg(path: str | os.PathLike[str], batch: Batch, strict: bool = False) -> tuple[str, ...]:
+def write_pyfg(path: str | os.PathLike[str], batch: Batch, strict: bool = False) -> Notes:
     """Write `batch` to a path, as `as_pyfg` makes it; returns its notes.  Raises FormatError."""
     written = as_pyfg(batch, strict)
     write_whole(path, written.text, encoding="ascii")
@@ -54,7 +54,7 @@ def as_pyfg(batch: Batch, strict: bool = False) -> Written:
     poses_first = sorted(kept.variables, key=lambda group: not VARIABLE_KINDS[group.kind].is_pose)
     lines = [line for group in poses_first for line in _vertex_lines(group, stamps)]
     lines += [line for group in kept.factors for line in _factor_lines(group, stamps)]
-    return Written("\n".join([*lines, ""]), tuple(left.notes), dict(left.counts))
+    return Written("\n".join([*lines, ""]), left.told())
 
 
 def _stamps(batch: Batch, left: LeftOut) -> dict[int, int]:

@@ -17,11 +17,12 @@ from factorbus.cli.process.reading import (
     reading_options,
     robot_option,
     say,
+    told_of,
 )
 from factorbus.wording import counted
 
 if TYPE_CHECKING:
-    from factorbus.formats import GraphFile
+    from factorbus.formats import GraphFile, Notes
 
 _WRITES = (*GRAPHS, ".tum", ".kitti")
 
@@ -99,7 +100,7 @@ def command(
     say(target, notes)
     if as_json:
         about = {"source": str(source), "read": graph.summary(whole=True), "files": [str(file) for file in files]}
-        document({**about, "notes": list(notes), **counts})
+        document({**about, **told_of(notes), **counts})
     told = ", ".join(counted(counts[many], one) for many, one in COUNTED)
     print_note(f"{', '.join(map(str, files))}: {told}")
 
@@ -139,9 +140,9 @@ def _check_any(graph: "GraphFile", target: Path) -> None:
 
 def _written(
     graph: "GraphFile", target: Path, strict: bool, robot: str | None, ids: str
-) -> tuple[list[Path], tuple[str, ...], dict[str, int]]:
+) -> tuple[list[Path], "Notes", dict[str, int]]:
     """(the files, what was left out of them, how much is in them).  Raises FormatError, SeveralRobots."""
-    from factorbus.formats import tum_notes, write_graph, write_kitti, write_tum
+    from factorbus.formats import Notes, tum_notes, write_graph, write_kitti, write_tum
     from factorbus.formats.left_out import LeftOut
     from factorbus.formats.trajectory import one_trajectory, trajectories, untimed
 
@@ -159,7 +160,7 @@ def _written(
     if graph.log is not None and graph.log.known:
         left.drop("ground truth values", graph.log.known, "--ground-truth writes them in place of the others")
     left.drop("poses", graph.poses - sum(map(len, chosen)), f"of other robots than {robot!r}")
-    write, notes = (write_tum, tum_notes) if form == "TUM" else (write_kitti, lambda *_: ())
+    write, notes = (write_tum, tum_notes) if form == "TUM" else (write_kitti, lambda *_: Notes())
     untold = sum(len(untimed(rows)) for rows in chosen) if form == "TUM" else 0
     written = {"poses": sum(map(len, chosen)) - untold, "landmarks": 0, "factors": 0}
-    return write(target, graph.batch, robot), (*left.notes, *notes(graph.batch, robot)), written
+    return write(target, graph.batch, robot), left.told().and_those(notes(graph.batch, robot)), written

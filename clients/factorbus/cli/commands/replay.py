@@ -9,10 +9,11 @@ from typing import Any
 
 import click
 
+from factorbus.cli.driving.replay_files import AskedFiles, ReplayedDrive, write_files
 from factorbus.cli.driving.replay_reading import check_kind, read_steps
 from factorbus.cli.driving.replay_source import source_of
 from factorbus.cli.driving.replay_table import replay_rows
-from factorbus.cli.output.exits import REFUSED, Stopped, missing_modules, output_file, require
+from factorbus.cli.output.exits import REFUSED, Stopped, missing_modules, require
 from factorbus.cli.output.starts import optimum_from
 from factorbus.cli.process.options import (
     SECONDS,
@@ -25,7 +26,7 @@ from factorbus.cli.process.options import (
     zenoh_option,
 )
 from factorbus.cli.process.parameters_file import NodeCommand, params_file_option
-from factorbus.cli.process.reading import ROBOT_LOGS, reading_options, say
+from factorbus.cli.process.reading import reading_options, told_of
 from factorbus.cli.process.robot_options import robot_options
 from factorbus.ros2.options import RobotOptions
 
@@ -214,13 +215,12 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
         adopted = None
         if request.settle and request.adopt:
             last, adopted = _adopt(request, target, last)
-        written = _write(request, target, graph, steps)
+        asked = AskedFiles(request.out, request.tum, request.kitti, request.plot, request.strict)
         truth = graph.log.ground_truth if graph.log else ()
-        if request.plot:
-            with output_file(request.plot):
-                _draw(request.plot, request.file.name, driven, target, steps, truth)
+        written, notes = write_files(asked, request.file.name, ReplayedDrive(target, graph, steps, driven, truth))
         result = _document(request, driven, target, steps, last, unsettled, before)
-        result |= {"read": graph.summary(), "written": [str(file) for file in written], "adopted": adopted}
+        result |= {"read": graph.summary(), "written": [str(file) for file in written], **told_of(notes)}
+        result |= {"adopted": adopted}
         result |= {"error_m": aligned_error_m(truth, target.estimate())} if truth else {}
         report(result)
         if request.live:
@@ -340,46 +340,6 @@ def _stay() -> None:
     with stop_when_asked(until_eof=False) as stop:
         print_note("the page stays until Ctrl-C")
         stop.wait()
-
-
-def _write(request: ReplayRequest, target: Any, source: Any, steps: Any) -> list[Path]:
-    """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
-    from factorbus.cli.driving.places import places_only
-    from factorbus.cli.output.console import print_note
-    from factorbus.formats import write_graph, write_kitti, write_tum
-    from factorbus.proto.messages import Batch
-
-    files: list[Path] = []
-    if request.out:
-        ids = source.numbering if source.numbering != "ids" else "auto"
-        with output_file(request.out):
-            notes = write_graph(request.out, target.graph(), request.strict, ids, _truth_of(source, request.out))
-        say(request.out, notes)
-        files.append(request.out)
-    for path, write in ((request.tum, write_tum), (request.kitti, write_kitti)):
-        if path:
-            with output_file(path):
-                robots = write(path, Batch(places_only(target.estimate(), steps)))
-            if robots != [path]:
-                print_note(f"{path}: one file for each robot: {', '.join(map(str, robots))}")
-            files += robots
-    return files
-
-
-def _truth_of(source: Any, out: Path) -> Any:
-    """Of the log that was read what a file of the map can have: a map has no labels of factors."""
-    return replace(source.log, labels=()) if source.log and out.suffix in ROBOT_LOGS else None
-
-
-def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any, truth: Any) -> None:
-    from factorbus.cli.driving.aligned_truth import aligned_truth
-    from factorbus.cli.driving.picture import draw, history_of
-    from factorbus.cli.driving.places import places_only
-
-    reports = [step.report for step in driven.steps]
-    estimate = places_only(target.estimate(), steps)
-    history = history_of(reports, target.compared())
-    draw(path, steps, estimate, history, title, truth=aligned_truth(truth, estimate))
 
 
 def _fixed(steps: Any) -> list[str]:

@@ -7,7 +7,7 @@ import click
 
 from factorbus.cli.output.exits import REFUSED, Stopped, output_file
 from factorbus.cli.process.options import checked_output, connect_option, json_option, timeout_option, zenoh_option
-from factorbus.cli.process.reading import GRAPHS, IDS, ROBOT_LOGS, check_chosen
+from factorbus.cli.process.reading import GRAPHS, IDS, ROBOT_LOGS, check_chosen, say, told_of
 
 if TYPE_CHECKING:
     from factorbus.client import Map
@@ -40,7 +40,8 @@ def command(
     as_json: bool,
 ) -> None:
     """Write MAP as it is now into FILE: the whole graph as .g2o, .pyfg, .jrl or .jrl.cbor, or trajectories as .tum
-    or .kitti, by its ending.
+    or .kitti, by its ending. What has no place in FILE is left out and said; --json has it in "notes", and counted by
+    kind in "left_out".
 
     A trajectory is of one robot, the letter of its poses' keys. Of several each gets a file of its own: out.tum becomes
     out-a.tum and out-b.tum. Its times are the poses' time stamps, and where no pose has one the numbers of their keys;
@@ -57,26 +58,28 @@ def command(
     check_chosen(target, robot, ids)
     from factorbus.cli.output.console import document
     from factorbus.cli.process.bus import open_bus
-    from factorbus.formats import recoded, write_whole
+    from factorbus.formats import Notes, recoded, write_whole
 
     form = "jrl" if target.suffix in ROBOT_LOGS else target.suffix.removeprefix(".")
     with open_bus(endpoint, "save", zenoh, timeout_s) as bus, bus.map(name, mirror=False, create=False) as joined:
         robots = [] if target.suffix in GRAPHS else _robots(joined, robot)
         texts = (
-            {letter: joined.export(form, robot=letter) for letter in robots}
+            {letter: joined.ask.export(form, timeout_s, letter).result() for letter in robots}
             if robots
-            else {"": joined.export(form, ids=ids or "auto")}
+            else {"": joined.ask.export(form, timeout_s, ids=ids or "auto").result()}
         )
-    files = []
-    for letter, text in texts.items():
+    files, notes = [], Notes()
+    for letter, exported in texts.items():
         path = target if len(texts) == 1 else target.with_name(f"{target.stem}-{letter or 'none'}{target.suffix}")
         with output_file(path):
-            write_whole(path, recoded(text) if path.suffix == ".cbor" else text)
+            write_whole(path, recoded(exported.text) if path.suffix == ".cbor" else exported.text)
         files.append(str(path))
+        say(path, exported.notes)
+        notes = notes.and_those(Notes(exported.notes, exported.left_out))
         if not as_json:
             click.echo(path)
     if as_json:
-        document({"map": name, "files": files})
+        document({"map": name, "files": files, **told_of(notes)})
 
 
 def _robots(joined: "Map", robot: str | None) -> list[str]:

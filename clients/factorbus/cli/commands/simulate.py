@@ -56,11 +56,11 @@ def command(
         raise click.UsageError("there is nothing to write: give --out FILE.g2o, --truth FILE.tum or both")
     from factorbus.cli.driving.columns import merged
     from factorbus.cli.output import console as screen
-    from factorbus.cli.process.reading import ROBOT_LOGS, say
-    from factorbus.formats import RobotLog, write_graph, write_tum
+    from factorbus.cli.process.reading import ROBOT_LOGS, say, told_of
+    from factorbus.formats import Notes, RobotLog, write_graph, write_tum
     from factorbus.proto.messages import Batch
 
-    batches, truths = [], []
+    batches, truths, notes = [], [], Notes()
     with screen.progress(world, poses) as show:
         for number, step in enumerate(_steps(world, poses, seed), 1):
             batches.append(step.batch)
@@ -79,13 +79,13 @@ def command(
             write_tum(truth, merged(truths))
         screen.print_note(f"{truth}: {counted(poses, 'pose')}, as they are")
     if as_json:
-        _document(world, poses, seed, [out, truth])
+        _document(world, poses, seed, [out, truth], **told_of(notes))
 
 
-def _document(world: str, poses: int, seed: int, files: list[Path | None]) -> None:
+def _document(world: str, poses: int, seed: int, files: list[Path | None], **more: Any) -> None:
     from factorbus.cli.output.console import document
 
-    document({"world": world, "poses": poses, "seed": seed, "files": [str(each) for each in files if each]})
+    document({"world": world, "poses": poses, "seed": seed, "files": [str(each) for each in files if each], **more})
 
 
 def _inertial(poses: int, seed: int, out: Path | None, folder: Path | None, truth: Path | None) -> None:
@@ -106,6 +106,7 @@ def _inertial(poses: int, seed: int, out: Path | None, folder: Path | None, trut
     if truth:
         with output_file(truth):
             write_tum(truth, Batch(read_euroc(folder / "mav0").steps().truth()))
+        screen.print_note(f"{truth}: {counted(poses, 'pose')}, as they are")
 
 
 def _steps(world: str, poses: int, seed: int) -> Iterator[Any]:

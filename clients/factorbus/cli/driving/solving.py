@@ -13,7 +13,7 @@ from factorbus.cli.driving.replay_source import source_of
 from factorbus.cli.output.console import print_note
 from factorbus.cli.output.exits import USAGE, Stopped, output_file
 from factorbus.cli.output.starts import NOT_CONVERGED
-from factorbus.cli.process.reading import COUNTED, GRAPHS, ROBOT_LOGS, say
+from factorbus.cli.process.reading import COUNTED, GRAPHS, ROBOT_LOGS, say, told_of
 from factorbus.proto.messages import Batch
 from factorbus.proto.roles import poses_aside
 from factorbus.proto.symbols import format_symbol
@@ -21,6 +21,7 @@ from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from factorbus.cli.driving.optimum import WorkerCores
+    from factorbus.formats import Notes
 
 _START = {"file": "values"}  # the solver's word
 _WORDS = {"values": "file"}
@@ -47,7 +48,7 @@ class SolveRequest:
 def run_solve(request: SolveRequest) -> dict[str, Any]:
     """Do it, with progress on standard error; returns the document.  Raises Stopped, FormatError, SolverError."""
     from factorbus.cli.driving.optimum import WorkerCores, optimum_of, with_loss_on_loops, without_false
-    from factorbus.formats import write_whole
+    from factorbus.formats import Notes, write_whole
     from factorbus.service.process.memory import available
     from factorbus.solver import BatchSearch
 
@@ -85,7 +86,7 @@ def run_solve(request: SolveRequest) -> dict[str, Any]:
     }
     if not found.converged:
         print_note(f"{NOT_CONVERGED}; --max-iterations, or another --start")
-    written = _write(request.out, solved, source, request.strict) if request.out else []
+    written, notes = _write(request.out, solved, source, request.strict) if request.out else ([], Notes())
     if request.covariance is not None:
         rows = _timed(seconds, "covariance", lambda: _covariances(solved, request.covariance))
         if isinstance(request.covariance, Path):
@@ -94,7 +95,7 @@ def run_solve(request: SolveRequest) -> dict[str, Any]:
             written.append(request.covariance)
         else:
             result["covariance"] = {name: block.tolist() for name, _, block in rows}
-    return result | {"seconds": seconds, "written": [str(path) for path in written]}
+    return result | {"seconds": seconds, "written": [str(path) for path in written], **told_of(notes)}
 
 
 def solution_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -215,9 +216,9 @@ def _csv(rows: list[tuple[str, str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write(out: Path, graph: Batch, source: Any, strict: bool) -> list[Path]:
-    """The files.  Raises Stopped, FormatError."""
-    from factorbus.formats import tum_notes, write_graph, write_kitti, write_tum
+def _write(out: Path, graph: Batch, source: Any, strict: bool) -> tuple[list[Path], "Notes"]:
+    """The files, and what was left out of them.  Raises Stopped, FormatError."""
+    from factorbus.formats import Notes, tum_notes, write_graph, write_kitti, write_tum
 
     with output_file(out):
         if out.suffix in GRAPHS:
@@ -228,11 +229,11 @@ def _write(out: Path, graph: Batch, source: Any, strict: bool) -> list[Path]:
         else:
             kitti = out.suffix == ".kitti"
             files = (write_kitti if kitti else write_tum)(out, Batch(graph.variables))
-            notes = () if kitti else tum_notes(graph, None)
+            notes = Notes() if kitti else tum_notes(graph, None)
     say(out, notes)
     if files != [out]:
         print_note(f"{out}: one file for each robot: {', '.join(map(str, files))}")
-    return files
+    return files, notes
 
 
 def _timed(seconds: dict[str, float], name: str, work: Callable[[], Any]) -> Any:

@@ -11,7 +11,7 @@ from factorbus.cli.output.exits import BAD_FILE, Stopped
 
 if TYPE_CHECKING:
     from factorbus.cli.logs.sensor_log import SensorLog
-    from factorbus.formats import GraphFile
+    from factorbus.formats import GraphFile, Notes
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -91,6 +91,11 @@ def is_recording(path: Path) -> bool:
         ending = Path(path.stem).suffix if path.suffix == _COMPRESSED else path.suffix
         return path.name == _METADATA or ending in _RECORDINGS
     return (path / _METADATA).is_file() or any(each.suffix in _RECORDINGS[:2] for each in path.iterdir())
+
+
+def told_of(notes: "Notes") -> dict[str, Any]:
+    """For `--json`: what was left out of the files that were written, as `read` says it of one that was read."""
+    return {"notes": list(notes), "left_out": dict(notes.counts)}
 
 
 def say(path: Path, notes: tuple[str, ...]) -> None:

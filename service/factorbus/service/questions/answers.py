@@ -7,7 +7,7 @@ somebody else's time, and no reader sees half a step or holds one up.
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from factorbus.service.questions.question_memory import COPIES, Room
 from factorbus.service.questions.uncertainty import DECODE, MissingVariables, Uncertain, check_keys, near_variables
 from factorbus.solver.changes.repair import repair
 from factorbus.solver.errors import SolverError
+
+if TYPE_CHECKING:
+    from factorbus.formats import Notes
 
 _GRAPHS, _TRAJECTORIES = ("g2o", "pyfg", "jrl"), ("tum", "kitti")
 _IDS = ("auto", "ids", "keys", "counted")
@@ -257,7 +260,7 @@ def _answer(question: Question, taken: QuestionCopies) -> bytes:
         return encode_components(components_of_map(taken.graph))
     text, notes = _text(question, taken.graph.batch)
     told = {"epoch": taken.epoch, "revision": taken.revision, "format": question.format}
-    return codec.encode_map({**told, "text": text, "notes": notes})
+    return codec.encode_map({**told, "text": text, "notes": list(notes), "left_out": notes.counts})
 
 
 def _repaired(taken: QuestionCopies, ask: AskRepair) -> bytes:
@@ -310,10 +313,10 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
     return tuple(chosen)
 
 
-def _text(question: Question, batch: Batch) -> tuple[str, list[str]]:
+def _text(question: Question, batch: Batch) -> tuple[str, "Notes"]:
     """(the file, what was left out of it).  Raises FormatError, SeveralRobots."""
     # Only who asks for an export pays for it.
-    from factorbus.formats import as_g2o, as_jrl, as_pyfg, kitti_text, tum_notes, tum_text
+    from factorbus.formats import Notes, as_g2o, as_jrl, as_pyfg, kitti_text, tum_notes, tum_text
 
     if question.format in _GRAPHS:
         strict = question.strict
@@ -321,7 +324,7 @@ def _text(question: Question, batch: Batch) -> tuple[str, list[str]]:
             written = as_g2o(batch, strict, question.ids)
         else:
             written = {"pyfg": as_pyfg, "jrl": as_jrl}[question.format](batch, strict)
-        return written.text, list(written.notes)
+        return written.text, written.notes
     if question.format == "tum":
-        return tum_text(batch, question.robot), list(tum_notes(batch, question.robot))
-    return kitti_text(batch, question.robot), []
+        return tum_text(batch, question.robot), tum_notes(batch, question.robot)
+    return kitti_text(batch, question.robot), Notes()

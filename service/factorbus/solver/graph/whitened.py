@@ -38,8 +38,10 @@ class Whitened:
 
 
 def whitened(graph: FactorGraph, rows: Iterable[int], first: list[int], fixed: Collection[int] = ()) -> Whitened:
-    """Of the factors `rows`; the variables `first` come first, behind them the others on these factors, ascending: those
-    that are free, and of fixed ones those in `fixed`."""
+    """Of the factors `rows`; the variables `first` come first, behind them the others on these factors, ascending.
+
+    Of the others those that are free, and of fixed ones those in `fixed`.
+    """
     rows = list(rows)
     ends = {v for row in rows for v in graph.ends_of(row)} - set(first)
     variables = [*first, *sorted(v for v in ends if graph.var[v, at.V_COLUMN] >= 0 or v in fixed)]
