@@ -270,6 +270,6 @@ def test_ranges_go_from_pyfg_to_pyfg_and_through_a_replay(folder: Path, capsys: 
     assert read(folder / "b.pyfg").batch.factor_count == 7
     assert main(["convert", "a.pyfg", "c.pyfg", "--ids", "keys"]) == USAGE
     assert main(["replay", "a.pyfg", "--in-process", "--mode", "inc-l", "--out", "d.pyfg"]) == OK
-    assert "1 fixed variable left out" in capsys.readouterr().err
+    assert "1 fixed variable written as free" in capsys.readouterr().err
     again = read(folder / "d.pyfg").batch
     assert {group.kind for group in again.factors} == {"between_se2", "range_se2"}

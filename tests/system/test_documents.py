@@ -11,7 +11,7 @@ from processes import PATIENCE_S
 
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import FAILED, OK
-from factorbus.client import connect
+from factorbus.client import Changes, connect
 
 MAPS = {"hall": 30, "yard": 20}
 
@@ -43,7 +43,9 @@ def test_maps_are_saved_budgeted_copied_put_back_checked_and_dropped(
                 joined.wait_converged()
                 revisions[name] = joined.ask_estimate().revision
     at = ("--connect", endpoint)
-    assert ask("save", "hall", str(tmp_path / "hall.g2o"), *at) == {"map": "hall", "files": [f"{tmp_path}/hall.g2o"]}
+    untimed = "26 time stamps left out: g2o has no record for the time of se2 variables"
+    saved = {"map": "hall", "files": [f"{tmp_path}/hall.g2o"], "notes": [untimed], "left_out": {"time stamps": 26}}
+    assert ask("save", "hall", str(tmp_path / "hall.g2o"), *at) == saved
     assert (tmp_path / "hall.g2o").read_text().count("VERTEX_SE2") == MAPS["hall"]
     assert ask("budget", "hall", "5", *at) == {"map": "hall", "budget_ms": 5.0}
     assert ask("budget", "hall", "none", *at) == {"map": "hall", "budget_ms": None}
@@ -68,6 +70,40 @@ def test_maps_are_saved_budgeted_copied_put_back_checked_and_dropped(
     assert "yard" not in [row["name"] for row in ask("maps", *at)["maps"]]
 
 
+NO_RECORD = {
+    "out.g2o": ("g2o has no record for such factors", {"time stamps": 4}),
+    "out.pyfg": ("PyFactorGraph (.pyfg) has no record for such factors", {"fixed variables": 1}),
+    "out.jrl": ("JRL (.jrl, .jrl.cbor) has no record for such factors", {"fixed variables": 1}),
+    "out.cbor": ("JRL (.jrl, .jrl.cbor) has no record for such factors", {"fixed variables": 1}),
+}
+
+
+@pytest.mark.parametrize("file", NO_RECORD)
+def test_what_a_file_has_no_record_for_is_in_the_document(
+    services: Callable[..., Services],
+    tmp_path: Path,
+    ask: Callable[..., dict[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+    file: str,
+) -> None:
+    why, more = NO_RECORD[file]
+    endpoint = services(tmp_path / "journal").start()
+    with connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus, bus.map("hall") as joined:
+        for batch in drafts(6):
+            joined.insert(batch)
+        joined.change(Changes().marginalize("x2"))
+        kind = joined.graph().batch.factors[-1].kind
+    assert kind.startswith("linear_")
+    told = ask("save", "hall", str(tmp_path / file), "--connect", endpoint)
+    assert told["left_out"] == {kind: 1, **more}
+    assert f"1 {kind} left out: {why}" in told["notes"]
+    form = why.partition(" has")[0]
+    if "fixed variables" in more:
+        assert f"1 fixed variable written as free: {form} does not say which variables are fixed" in told["notes"]
+    assert main(["save", "hall", str(tmp_path / file), "--connect", endpoint]) == OK
+    assert capsys.readouterr().err.splitlines() == [f"{tmp_path / file}: {note}" for note in told["notes"]]
+
+
 def test_a_map_that_cannot_be_read_is_a_row_with_its_problem(
     services: Callable[..., Services], tmp_path: Path, ask: Callable[..., dict[str, Any]]
 ) -> None:
@@ -90,7 +126,7 @@ def test_a_map_that_cannot_be_read_is_a_row_with_its_problem(
 def test_a_world_and_the_version(tmp_path: Path, ask: Callable[..., dict[str, Any]]) -> None:
     out = str(tmp_path / "town.g2o")
     made = ask("simulate", "manhattan", "--poses", "5", "--seed", "3", "--out", out)
-    assert made == {"world": "manhattan", "poses": 5, "seed": 3, "files": [out]}
+    assert made == {"world": "manhattan", "poses": 5, "seed": 3, "files": [out], "notes": [], "left_out": {}}
     folder = str(tmp_path / "drive")
     assert ask("simulate", "inertial", "--poses", "4", "--folder", folder)["files"] == [folder]
     told = ask("version")

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.commands.components import components_command
+from factorbus.cli.commands.covariance import covariance_command
 from factorbus.cli.commands.suspects import suspects_command
 from factorbus.cli.output.advice import advising, of_what_is_there
 from factorbus.cli.output.console import document, table
@@ -15,7 +16,6 @@ from factorbus.cli.output.exits import FAILED, OK, input_file
 from factorbus.cli.output.starts import NOT_CONVERGED, optimum_from, ratio_to
 from factorbus.cli.process.options import MapAddress, Number, asks_map, file_argument
 from factorbus.cli.process.reading import read_graph, reading_options
-from factorbus.wording import counted
 
 _SHOWN = 20  # more false factors than these are listed with --json only
 
@@ -41,62 +41,6 @@ _probability = click.option(
     show_default=True,
     help="With which a right measurement passes.",
 )
-
-
-@command.command("covariance")
-@asks_map
-@click.argument("keys", nargs=-1)
-@click.option("--joint", is_flag=True, help="Of all KEYS together, one matrix.")
-@click.option("--relative", is_flag=True, help="Of the second as seen from the first, pair by pair.")
-@click.option("--last", is_flag=True, help="Of the pose that was inserted last.")
-def covariance_command(address: MapAddress, keys: tuple[str, ...], as_json: bool, **asked: bool) -> int:
-    """How certain the variables KEYS are, or all of them: standard deviations in their own frames, metres and radians.
-
-    \b
-    factorbus ask covariance warehouse x12 l3
-    factorbus ask covariance warehouse x12 x300 --relative
-    factorbus ask covariance warehouse --last --json
-    """
-    import numpy as np
-
-    from factorbus.proto.symbols import format_symbol
-
-    chosen = [name for name in ("joint", "relative", "last") if asked[name]]
-    if len(chosen) > 1:
-        raise click.UsageError(f"{' and '.join(f'--{name}' for name in chosen)} exclude each other")
-    blocks = chosen[0] if chosen else None
-    if blocks == "last" and keys:
-        raise click.UsageError(f"--last is of the pose inserted last: it takes no KEYS, and got {' '.join(keys)}")
-    if blocks in ("joint", "relative") and not keys:
-        raise click.UsageError(f"--{blocks} needs KEYS")
-    if blocks == "relative" and len(keys) % 2:
-        verb = "is" if len(keys) == 1 else "are"
-        raise click.UsageError(
-            f"--relative wants KEYS in pairs, such as x12 x300; there {verb} {counted(len(keys), 'key')}"
-        )
-    with _map(address) as joined:
-        found = joined.uncertainty.ask.covariance(blocks or "diagonal", keys or None, None, address.timeout_s).result()
-    if found.covariance is not None:
-        names = [format_symbol(int(key)) for key in found.keys]
-        if as_json:
-            document({"revision": found.revision, "keys": names, "covariance": found.covariance.tolist()})
-        else:
-            click.echo(np.array2string(found.covariance, precision=6, suppress_small=False))
-        return OK
-    rows = [
-        (" ".join(format_symbol(int(key)) for key in np.atleast_1d(one)), group.kind, block)
-        for group in found.groups
-        for one, block in zip(group.keys, group.covariance, strict=True)
-    ]
-    if as_json:
-        content = [{"keys": keys.split(), "kind": kind, "covariance": block.tolist()} for keys, kind, block in rows]
-        document({"revision": found.revision, "blocks": content})
-    else:
-        table(
-            [(keys, "  ".join(f"{sigma:.4g}" for sigma in np.sqrt(block.diagonal()))) for keys, _, block in rows],
-            title=f"Standard deviations at revision {found.revision}",
-        )
-    return OK
 
 
 @command.command("gate")
@@ -227,7 +171,11 @@ def _tell(what: str, found: Any) -> None:
     if found.variable:
         table(_variable_rows(found.variable), title=f"{what} at revision {found.revision}")
         rows = [(_named(each), _factor_line(each, found.step)) for each in found.variable["factors"]]
-        table(rows, title="Its factors, by id")
+        if rows:
+            table(rows, title="Its factors, by id")
+        else:
+            held = "it is fixed where it is" if found.variable["fixed"] else "nothing holds it"
+            click.echo(f"No factor is on {what}: {held}.")
     else:
         table([(_named(found.factor), _factor_line(found.factor, found.step))], title=f"At revision {found.revision}")
     step = found.step
@@ -312,7 +260,7 @@ def repair_command(
         return OK
     table(
         [
-            ("looked at", str(found.suspects)),
+            ("looked at", str(found.suspects) if found.suspects else "0: no factor in the map closes a loop"),
             ("false", f"{len(rows)}{', taken care of' if applied and rows else ''}"),
             ("χ², each suspect up to its bound", f"{found.before:.6g}, repaired {found.after:.6g}"),
             ("χ² without the false ones", f"{found.chi2_left:.6g}"),
@@ -323,16 +271,21 @@ def repair_command(
     return OK
 
 
+command.add_command(covariance_command, "covariance")
 command.add_command(suspects_command, "suspects")
 command.add_command(components_command, "components")
 
 
 def _variable_rows(explained: Any) -> list[tuple[str, str]]:
+    from factorbus.cli.output.tangents import named_sigmas
+    from factorbus.proto.variable_kinds import VARIABLE_KINDS
+
+    value = "  ".join(f"{number:.6g}" for number in explained["value"])
     return [
         ("kind", explained["kind"] + (", fixed" if explained["fixed"] else "")),
         *([("time stamp", f"{explained['stamp']} ns")] if explained.get("stamp") is not None else []),
-        ("value", "  ".join(f"{number:.6g}" for number in explained["value"])),
-        ("sigmas", "  ".join(f"{number:.4g}" for number in explained["sigmas"])),
+        ("value", f"{value}  ({VARIABLE_KINDS[explained['kind']].values})"),
+        ("sigmas", named_sigmas(explained["kind"], explained["sigmas"])),
         ("smallest pivot of R", f"{explained['pivot']:.4g}"),
         ("smallest R²ᵢᵢ/Λᵢᵢ", f"{explained['conditioning']:.2g}"),
     ]

@@ -15,7 +15,9 @@ from factorbus.cli.output.starts import optimum_from
 from factorbus.cli.process.options import MapAddress, Number, asks_map
 
 F = TypeVar("F", bound=Callable[..., Any])
-_COUNTS = ("removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables")
+_COUNTS = (
+    "removed_variables", "removed_factors", "added_factors", "edited_factors", "fixed_variables", "freed_variables",
+)  # fmt: skip
 
 
 @click.group()
@@ -28,6 +30,7 @@ def command() -> None:
     factorbus change remove warehouse 17 18 x12
     factorbus change loss warehouse dcs 1.0 21
     factorbus change fix warehouse x0
+    factorbus change marginalize warehouse x1 x2
     factorbus change fork warehouse what-if
     factorbus change merge warehouse robot2 --letter x=y --anchor x5 y8 0,2,-1.57 --sigmas 0.1,0.1,0.05
     factorbus change attach warehouse b matches.txt --sigmas 0.1,0.1,0.05
@@ -148,6 +151,24 @@ def free_command(address: MapAddress, keys: tuple[str, ...], **how: Any) -> int:
     from factorbus.client import Changes
 
     return _make(address, Changes().free(*keys), **how)
+
+
+@command.command("marginalize")
+@_changing
+@click.argument("keys", nargs=-1, required=True)
+def marginalize_command(address: MapAddress, keys: tuple[str, ...], **how: Any) -> int:
+    """Take variables out for good, and keep what their factors say of the others, as linear factors.
+
+    The estimate of what stays, and how certain it is, are as before. What hangs together goes into one factor: refused
+    (too_connected) where it shares factors with more than 128 variables that stay. What they said is linearized where
+    the map is now; it cannot be edited factor by factor afterwards, and g2o has no record for it.
+
+    \b
+    factorbus change marginalize warehouse x1 x2 l7
+    """
+    from factorbus.client import Changes
+
+    return _make(address, Changes().marginalize(*keys), **how)
 
 
 @command.command("adopt")

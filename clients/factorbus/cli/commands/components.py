@@ -37,6 +37,8 @@ def components_command(address: MapAddress, as_json: bool) -> int:
         found = joined.components(address.timeout_s)
     if as_json:
         document({"revision": found.revision, **components_document(found)})
+    elif not found.count and not found.in_no_frame:
+        click.echo(f"There is no variable in the map at revision {found.revision}.")
     else:
         table(_rows(components_document(found)), title=f"At revision {found.revision}")
     return OK

@@ -78,7 +78,8 @@ def _covariance(ctx: click.Context, parameter: click.Parameter, text: str | None
     "--covariance",
     callback=_covariance,
     metavar="KEYS|FILE.csv",
-    help="Covariance of x5,l3,... at the optimum; or of all variables, into a file.",
+    help="Covariance of x5,l3,... at the optimum; or of all variables, into a file. Rows are in the order of "
+    "`factorbus ask covariance`: x y theta, or x y z rx ry rz (m, rad).",
 )
 @click.option("--max-iterations", type=click.IntRange(1), default=500, show_default=True, help="Of one start.")
 @click.option("--cores", type=click.IntRange(1), metavar="N", help="Use N of them.  [default: all there are]")

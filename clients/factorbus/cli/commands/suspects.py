@@ -52,6 +52,8 @@ def suspects_command(address: MapAddress, every: bool, as_json: bool) -> int:
         rows = [("closures", "are trusted: this map tests none (`factorbus serve --closures test`)")]
     else:
         rows = [(state, str(count)) for state, count in found.counts.items()]
+        if not any(found.counts.values()):
+            rows = [("closures", "none: no factor in the map closes a loop yet")]
     for row in listed[:_SHOWN]:
         rows.append((str(row["factor"]), _in_words(row)))
     if len(listed) > _SHOWN:

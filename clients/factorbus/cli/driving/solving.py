@@ -13,6 +13,7 @@ from factorbus.cli.driving.replay_source import source_of
 from factorbus.cli.output.console import print_note
 from factorbus.cli.output.exits import USAGE, Stopped, output_file
 from factorbus.cli.output.starts import NOT_CONVERGED
+from factorbus.cli.output.tangents import named_sigmas, sigmas_of, tangent_document
 from factorbus.cli.process.reading import COUNTED, GRAPHS, ROBOT_LOGS, say, told_of
 from factorbus.proto.messages import Batch
 from factorbus.proto.roles import poses_aside
@@ -95,6 +96,8 @@ def run_solve(request: SolveRequest) -> dict[str, Any]:
             written.append(request.covariance)
         else:
             result["covariance"] = {name: block.tolist() for name, _, block in rows}
+            result["covariance_kinds"] = {name: kind for name, kind, _ in rows}
+            result["tangent"] = {kind: tangent_document(kind) for _, kind, _ in rows}
     return result | {"seconds": seconds, "written": [str(path) for path in written], **told_of(notes)}
 
 
@@ -116,7 +119,7 @@ def solution_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         if len(gnc["false"]) > _SHOWN:
             rows.append(("", f"and {len(gnc['false']) - _SHOWN} more (--json has all)"))
     for name, block in result.get("covariance", {}).items():
-        rows.append((f"{name}, σ", "  ".join(f"{sigma:.4g}" for sigma in np.sqrt(np.diag(block)))))
+        rows.append((f"{name}, σ", named_sigmas(result["covariance_kinds"][name], sigmas_of(np.array(block)))))
     rows += [("written", path) for path in result["written"]]
     return rows
 
