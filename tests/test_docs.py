@@ -89,6 +89,35 @@ def test_a_borrowed_document_with_a_bad_link_is_refused() -> None:
     assert notebook("# %% [markdown]\n# # Title\n# text\n\n# %%\nx = 1\n") == "# Title\ntext\n\n```python\nx = 1\n```\n"
 
 
+DOCS = ROOT / "docs"
+MARKED = re.compile(r"^<!-- \{\{ (\S+) \}\} -->\n(.*)$", re.M)
+PAGES = {page: page.read_text(encoding="utf-8") for page in sorted(DOCS.rglob("*.md"))}
+
+
+def test_a_page_in_a_clone_says_where_its_text_is() -> None:
+    shown = [(page, *found) for page, text in PAGES.items() for found in MARKED.findall(text)]
+    assert len(shown) >= 16
+    for page, document, line in shown:
+        (target,) = re.findall(r"\]\(([^)]+)\)", line)
+        assert (page.parent / target).resolve() == ROOT / document, page
+        assert (ROOT / document).is_file()
+    for page, text in PAGES.items():
+        assert not re.search(r"^(\{\{|\[commands\])", text, re.M), f"{page}: a mark without a word for a reader"
+
+
+def test_links_in_a_clone_lead_to_a_text() -> None:
+    """Not to pages that only the site fills: `borrowed` turns them there."""
+    empty = {page for page, text in PAGES.items() if MARKED.match(text)}
+    for page, text in PAGES.items():
+        prose = re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S)
+        for link in re.findall(r"(?<=\]\()[^)\s]+(?=\))", prose):
+            name, _, _ = link.partition("#")
+            if name and ":" not in name:
+                target = (page.parent / name).resolve()
+                assert target.is_file(), f"{page}: {link}"
+                assert target not in empty, f"{page}: {link} leads to a page without a text; name the document itself"
+
+
 @needs_docs
 def test_docstrings_are_read_as_they_are_meant() -> None:
     from docstrings import rewritten

@@ -1,8 +1,11 @@
 """Pages that are documents of the repository.
 
-A line `{{ proto/README.md }}` stands for that file: so a document has one text, which reads well in the repository and
-on the site.  Its links are turned: to pages where what they name is a page, to downloads where it is another file.  A
-notebook (`.py`, cells after `# %%`) becomes text and blocks of code.
+A mark `<!-- {{ proto/README.md }} -->` and the line below it stand for that file: so a document has one text, which
+reads well in the repository and on the site.  The line is for who reads the page in a clone: it says where the text is.
+A notebook (`.py`, cells after `# %%`) becomes text and blocks of code.
+
+On every page links to such documents are turned, to the pages that show them; links to other files are downloads.  So
+in a clone all links lead to a text.
 """
 
 import os
@@ -12,7 +15,7 @@ from pathlib import Path
 
 from sphinx.application import Sphinx
 
-_LINE = re.compile(r"^\{\{ (\S+) \}\}$", re.M)
+_LINE = re.compile(r"^<!-- \{\{ (\S+) \}\} -->\n.*$", re.M)
 _LINK = re.compile(r"(?<=\]\()([^)\s]+)(?=\))")
 _FENCE = re.compile(r"^(```.*?^```)$", re.M | re.S)
 
@@ -33,7 +36,8 @@ def _fill(app: Sphinx, page: str, content: list[str]) -> None:
         said = notebook(said) if path.suffix == ".py" else said
         return turned(said, path, folder / f"{page}.md", folder)
 
-    content[0] = _LINE.sub(text, content[0])
+    own = folder / f"{page}.md"
+    content[0] = _LINE.sub(text, turned(content[0], own, own, folder))
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The page of the commands: what `factorbus COMMAND --help` says, of each, where a line `[commands]` stands."""
+"""The page of the commands: what `factorbus COMMAND --help` says, of each, in place of a mark and the line below it."""
 
 from collections.abc import Iterator
 
@@ -17,8 +17,9 @@ def setup(app: Sphinx) -> dict[str, bool]:
 
 
 def _fill(_app: Sphinx, _page: str, content: list[str]) -> None:
-    if "\n[commands]\n" in content[0]:
-        content[0] = content[0].replace("\n[commands]\n", "\n".join(_sections(cli, "factorbus", 2)))
+    before, mark, behind = content[0].partition("<!-- [commands] -->\n")
+    if mark:  # below it is what somebody reads who has no site
+        content[0] = before + "\n".join(_sections(cli, "factorbus", 2)) + "\n" + behind.partition("\n")[2]
 
 
 def _sections(group: click.Group, name: str, level: int, parent: click.Context | None = None) -> Iterator[str]:
