@@ -230,5 +230,5 @@ def test_a_filter_gets_factors_and_its_problems_by_name(spawn: Spawn, tmp_path: 
                 front.grow(wrong, np.eye(13), observations.pixels)
         with pytest.raises(Unavailable):
             bus.features(observations.camera, service="another").factor(
-                x, observations.covariance, observations.pixels, 0.2
+                x, observations.covariance, observations.pixels, timeout_s=0.2
             )

@@ -26,7 +26,7 @@ from factorbus.client.changes import Changes, some_of
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.filter_state import Factored, FilterState
-from factorbus.client.key_numbers import Key
+from factorbus.client.key_numbers import Key, as_list
 from factorbus.client.map import Map as SyncMap
 from factorbus.client.map_row import MapRow
 from factorbus.client.merging import Merged, fit_into
@@ -139,14 +139,18 @@ class Features:
     def __init__(self, front: SyncFeatures) -> None:
         self._front = front
 
-    async def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> FilterState:
+    async def grow(
+        self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, *, timeout_s: float | None = None
+    ) -> FilterState:
         """State and covariance with a new feature for each pixel.  Raises as `factorbus.client.Features.grow`."""
-        growing = await asyncio.to_thread(self._front.send, x, P, pixels, timeout_s)
+        growing = await asyncio.to_thread(self._front.send, x, P, pixels, timeout_s=timeout_s)
         return await asyncio.to_thread(growing.result)
 
-    async def factor(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Factored:
+    async def factor(
+        self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, *, timeout_s: float | None = None
+    ) -> Factored:
         """The new features as factors.  Raises as `factorbus.client.Features.grow`."""
-        return await asyncio.to_thread(self._front.factor, x, P, pixels, timeout_s)
+        return await asyncio.to_thread(self._front.factor, x, P, pixels, timeout_s=timeout_s)
 
 
 class Map:
@@ -256,11 +260,13 @@ class Map:
         """Join the map as it is now and return its epoch; numbering starts again."""
         return await asyncio.to_thread(self._map.rejoin)
 
-    async def ask_estimate(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Estimate:
+    async def ask_estimate(
+        self, of: Sequence[Key] | Key | None = None, *more: Key, timeout_s: float | None = None
+    ) -> Estimate:
         """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
-        return await asyncio.wrap_future(self._map.ask.estimate(of, timeout_s))
+        return await asyncio.wrap_future(self._map.ask.estimate(as_list("ask_estimate", of, more), timeout_s))
 
-    async def chi2(self, batch: bool = False, timeout_s: float | None = None, *, values: bool = False) -> Chi2:
+    async def chi2(self, batch: bool = False, *, timeout_s: float | None = None, values: bool = False) -> Chi2:
         """Σ rᵀΩr of the estimate, and of the optimum from scratch, as `factorbus.client.Map.chi2`."""
         return await asyncio.wrap_future(self._map.ask.chi2(batch, timeout_s, values))
 
@@ -270,7 +276,7 @@ class Map:
         """Which factors are false, as in `factorbus.client.Map.repair`.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.repair(factors, probability, timeout_s))
 
-    async def suspects(self, every: bool = False, timeout_s: float | None = None) -> Suspects:
+    async def suspects(self, every: bool = False, *, timeout_s: float | None = None) -> Suspects:
         """Loop closures that the estimate does not have, as in `factorbus.client.Map.suspects`.
 
         Raises Refused, Unavailable.
@@ -299,6 +305,7 @@ class Map:
     async def export(
         self,
         format: str = "g2o",
+        *,
         timeout_s: float | None = None,
         robot: str | None = None,
         strict: bool = False,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from typing import Any
 
 from numpy.typing import ArrayLike
 
 from factorbus.client.draft import Draft
-from factorbus.client.key_numbers import Key
+from factorbus.client.key_numbers import Key, as_list
 from factorbus.client.uncertainty import (
     UncertaintyQuestions,
     association_question,
@@ -28,37 +29,49 @@ class Uncertainty:
     def __init__(self, ask: UncertaintyQuestions) -> None:
         self._ask = ask
 
-    async def covariance(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Covariances:
+    async def covariance(
+        self, of: Sequence[Key] | Key | None = None, *more: Key, timeout_s: float | None = None
+    ) -> Covariances:
         """The covariance of each of some variables, or of all of them."""
-        return await asyncio.wrap_future(self._ask.covariance("diagonal", of, None, timeout_s))
+        return await asyncio.wrap_future(
+            self._ask.covariance("diagonal", as_list("covariance", of, more), None, timeout_s)
+        )
 
     async def last(self, timeout_s: float | None = None) -> Covariances:
         """The covariance of the pose that was inserted last."""
         return await asyncio.wrap_future(self._ask.covariance("last", None, None, timeout_s))
 
-    async def joint(self, of: Sequence[Key] | Key, timeout_s: float | None = None) -> F64:
+    async def joint(self, of: Sequence[Key] | Key, *more: Key, timeout_s: float | None = None) -> F64:
         """The joint covariance (d, d) of some variables."""
-        return matrix_of(await asyncio.wrap_future(self._ask.covariance("joint", of, None, timeout_s)))
+        return matrix_of(
+            await asyncio.wrap_future(self._ask.covariance("joint", as_list("joint", of, more), None, timeout_s))
+        )
 
     async def cross(
-        self, rows: Sequence[Key] | Key, columns: Sequence[Key] | Key, timeout_s: float | None = None
+        self, rows: Sequence[Key] | Key, columns: Sequence[Key] | Key, *, timeout_s: float | None = None
     ) -> F64:
         """The covariance (d, e) between some variables and others."""
         return matrix_of(await asyncio.wrap_future(self._ask.covariance("cross", rows, columns, timeout_s)))
 
     async def relative(
-        self, pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key], timeout_s: float | None = None
+        self, pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key], *more: Any, timeout_s: float | None = None
     ) -> Covariances:
         """Of each pair, the second as seen from the first."""
-        return await asyncio.wrap_future(self._ask.covariance("relative", paired(pairs), None, timeout_s))
+        return await asyncio.wrap_future(
+            self._ask.covariance("relative", paired(as_list("relative", pairs, more)), None, timeout_s)
+        )
 
     async def gate(
-        self, candidates: Batch | Draft | Sequence[Factors], probability: float = 0.95, timeout_s: float | None = None
+        self,
+        candidates: Batch | Draft | Sequence[Factors],
+        probability: float = 0.95,
+        *,
+        timeout_s: float | None = None,
     ) -> Gated:
         """Which of the candidate factors are plausible."""
         return await asyncio.wrap_future(self._ask.gate(factors_of(candidates), probability, timeout_s))
 
-    async def gain(self, candidates: Batch | Draft | Sequence[Factors], timeout_s: float | None = None) -> Gained:
+    async def gain(self, candidates: Batch | Draft | Sequence[Factors], *, timeout_s: float | None = None) -> Gained:
         """How many nats of information each candidate factor would bring by itself."""
         return await asyncio.wrap_future(self._ask.gain(factors_of(candidates), timeout_s))
 

@@ -241,7 +241,7 @@ def _check_certain(given: Batch, z: F64, omega: F64) -> None:
 def _joint(of: Map, keys: list[int], timeout_s: float | None) -> F64:
     """The joint covariance of poses, in which one that comes twice stands twice."""
     unique, where = np.unique(keys, return_inverse=True)
-    whole = of.uncertainty.joint(unique.tolist(), timeout_s)
+    whole = of.uncertainty.joint(unique.tolist(), timeout_s=timeout_s)
     d = len(whole) // unique.size
     rows = (where[:, None] * d + np.arange(d)).ravel()
     return whole[np.ix_(rows, rows)]

@@ -142,7 +142,7 @@ class Bus:
         self._features.append(made)
         return made
 
-    def may_insert(self, name: str, timeout_s: float = 5.0) -> bool:
+    def may_insert(self, name: str, *, timeout_s: float = 5.0) -> bool:
         """Whether access control lets this client insert into map `name`; False if the bus drops it for `timeout_s`.
 
         Nothing is inserted for it.  Raises Refused, Unavailable, BadName, UnknownMap.
@@ -168,8 +168,8 @@ class Bus:
         self,
         name: str,
         mode: str = "auto",
-        timeout_s: float | None = None,
         *,
+        timeout_s: float | None = None,
         closures: str | None = None,
         budget_ms: float | None = None,
         keep: str | Mapping[str, Any] | None = None,
@@ -192,7 +192,7 @@ class Bus:
             raise NotSupported("a map that keeps some poses alone", str(row.protocol.get("product", "")))
         return row
 
-    def set_budget(self, name: str, budget_ms: float | None, timeout_s: float | None = None) -> MapRow:
+    def set_budget(self, name: str, budget_ms: float | None, *, timeout_s: float | None = None) -> MapRow:
         """Give the steps of map `name` another budget, from the next one on: its row, once a restart would know it.
 
         budget_ms: what a step may take, in milliseconds, up to a minute; None or 0: there is no bound, and what earlier
@@ -205,7 +205,7 @@ class Bus:
         except Refused as refused:
             raise self._named(name, refused) from None
 
-    def fork(self, name: str, target: str, timeout_s: float | None = None) -> MapRow:
+    def fork(self, name: str, target: str, *, timeout_s: float | None = None) -> MapRow:
         """A new map `target` that begins as map `name` is now: a what-if, which may be tried out and dropped.
 
         Variables, values, factors, their ids, losses and what is fixed are the same, to the bit; the epoch is another,
@@ -221,8 +221,8 @@ class Bus:
     def drop(
         self,
         name: str,
-        timeout_s: float | None = None,
         *,
+        timeout_s: float | None = None,
         revision: int | None = None,
         missing_ok: bool = False,
         damaged: bool = False,

@@ -88,15 +88,15 @@ class Features:
         """Whether the next large answer may come in shared memory: until one has shown that nobody there shares any."""
         return self._shared
 
-    def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> FilterState:
+    def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, *, timeout_s: float | None = None) -> FilterState:
         """State and covariance with a new feature for each pixel, and wait for them.
 
         x (m,), P (m, m): as they are.  pixels (n, 2): distorted, u v.
         Raises BadShape, TooLarge, Unavailable, and Refused with bad_pixel, bad_state, bad_camera: nothing was added.
         """
-        return self.send(x, P, pixels, timeout_s).result()
+        return self.send(x, P, pixels, timeout_s=timeout_s).result()
 
-    def send(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> "Growing":
+    def send(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, *, timeout_s: float | None = None) -> "Growing":
         """The same without waiting: several may be on their way.  x and P must not be changed until `result`."""
         state, covariance = _matching(x, P)
         observations = self._observations(state, covariance, pixels)
@@ -107,7 +107,7 @@ class Features:
         ask = Ask(observations, "rows", allocation.segment) if allocation else Ask(observations, "half")
         return Growing(self, state, covariance, ask, allocation, self._ask(ask, timeout_s))
 
-    def factor(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Factored:
+    def factor(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, *, timeout_s: float | None = None) -> Factored:
         """The new features as factors: O(m + n) numbers, from which any block of the covariance is formed on demand.
 
         Of P, its first 13 rows will do.  Raises as `grow`.

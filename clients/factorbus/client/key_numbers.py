@@ -33,6 +33,14 @@ def key_numbers(of: Iterable[Key] | Key) -> I64:
     return np.array([key_number(key) for key in _each(of)], np.int64)
 
 
+def as_list(where: str, of: Any, more: tuple[Any, ...]) -> Any:
+    """`of`, one or a list, of which nothing stands behind it.  Raises BadShape: several were given one by one."""
+    if more:
+        given = ", ".join(repr(each)[:40] for each in (of, *more))
+        raise BadShape(where, f"{given}, one by one", f"a list: {where}([{given}])")
+    return of
+
+
 def id_numbers(where: str, factors: Iterable[int] | int) -> I64:
     """The ids of factors; of one, an array of one.  Raises BadShape."""
     found = []

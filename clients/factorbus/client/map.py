@@ -15,7 +15,7 @@ from factorbus.client.arguments import checked_bound, checked_flag, checked_seco
 from factorbus.client.changes import Changes, some_of
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.interest_mirror import InterestMirror
-from factorbus.client.key_numbers import Key
+from factorbus.client.key_numbers import Key, as_list
 from factorbus.client.link import Link
 from factorbus.client.map_row import MapRow
 from factorbus.client.merging import Merged, as_trusted, fit_into
@@ -236,8 +236,8 @@ class Map:
     def ask_estimate(
         self,
         of: Sequence[Key] | Key | None = None,
+        *more: Key,
         timeout_s: float | None = None,
-        *,
         interest: Interest | None = None,
     ) -> Estimate:
         """Values from the service at one revision: all, of some variables, or of those in `interest`.
@@ -246,9 +246,9 @@ class Map:
         """
         if interest is not None:
             check_interest(self._protocol)
-        return self.ask.estimate(of, timeout_s, interest).result()
+        return self.ask.estimate(as_list("ask_estimate", of, more), timeout_s, interest).result()
 
-    def chi2(self, batch: bool = False, timeout_s: float | None = None, *, values: bool = False) -> Chi2:
+    def chi2(self, batch: bool = False, *, timeout_s: float | None = None, values: bool = False) -> Chi2:
         """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch, with `values` that itself.
 
         Where the map is above it by more than 1 % the answer's `notice` says so (`better_optimum`), and
@@ -267,7 +267,7 @@ class Map:
         """
         return self.ask.repair(factors, probability, timeout_s).result()
 
-    def suspects(self, every: bool = False, timeout_s: float | None = None) -> Suspects:
+    def suspects(self, every: bool = False, *, timeout_s: float | None = None) -> Suspects:
         """Loop closures that the estimate does not have, or `every` one: of a map that tests them.
 
         Raises Refused, Unavailable, NotSupported.
@@ -296,7 +296,7 @@ class Map:
         return present_clients(self._link, self.name, checked_seconds("timeout_s", timeout_s, self.timeout_s))
 
     def export(
-        self, format: str = "g2o", timeout_s: float | None = None, robot: str | None = None, strict: bool = False,
+        self, format: str = "g2o", *, timeout_s: float | None = None, robot: str | None = None, strict: bool = False,
         ids: str = "auto",
     ) -> str:  # fmt: skip
         """The map as the text of a file: "g2o", "pyfg", "jrl", "tum" or "kitti".

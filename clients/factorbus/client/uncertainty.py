@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import all_finite, as_numbers, checked_probability, checked_seconds, of_type
 from factorbus.client.draft import Draft
-from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
+from factorbus.client.key_numbers import Key, as_list, id_numbers, key_number, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import asking_codec, keys
 from factorbus.proto.arrays import F64
@@ -92,35 +92,41 @@ class Uncertainty:
     def __init__(self, ask: UncertaintyQuestions) -> None:
         self.ask = ask
 
-    def covariance(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Covariances:
+    def covariance(
+        self, of: Sequence[Key] | Key | None = None, *more: Key, timeout_s: float | None = None
+    ) -> Covariances:
         """The covariance of each of some variables, or of all of them: `answer[symbol("x", 3)]` is one block."""
-        return self.ask.covariance("diagonal", of, None, timeout_s).result()
+        return self.ask.covariance("diagonal", as_list("covariance", of, more), None, timeout_s).result()
 
     def last(self, timeout_s: float | None = None) -> Covariances:
         """The covariance of the pose that was inserted last: microseconds of the solver's time."""
         return self.ask.covariance("last", None, None, timeout_s).result()
 
-    def joint(self, of: Sequence[Key] | Key, timeout_s: float | None = None) -> F64:
+    def joint(self, of: Sequence[Key] | Key, *more: Key, timeout_s: float | None = None) -> F64:
         """The joint covariance (d, d) of some variables, their tangent spaces one after the other."""
-        return matrix_of(self.ask.covariance("joint", of, None, timeout_s).result())
+        return matrix_of(self.ask.covariance("joint", as_list("joint", of, more), None, timeout_s).result())
 
-    def cross(self, rows: Sequence[Key] | Key, columns: Sequence[Key] | Key, timeout_s: float | None = None) -> F64:
+    def cross(self, rows: Sequence[Key] | Key, columns: Sequence[Key] | Key, *, timeout_s: float | None = None) -> F64:
         """The covariance (d, e) between some variables and others."""
         return matrix_of(self.ask.covariance("cross", rows, columns, timeout_s).result())
 
     def relative(
-        self, pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key], timeout_s: float | None = None
+        self, pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key], *more: Any, timeout_s: float | None = None
     ) -> Covariances:
         """Of each pair, the second as seen from the first: its value and its covariance there."""
-        return self.ask.covariance("relative", paired(pairs), None, timeout_s).result()
+        return self.ask.covariance("relative", paired(as_list("relative", pairs, more)), None, timeout_s).result()
 
     def gate(
-        self, candidates: Batch | Draft | Sequence[Factors], probability: float = 0.95, timeout_s: float | None = None
+        self,
+        candidates: Batch | Draft | Sequence[Factors],
+        probability: float = 0.95,
+        *,
+        timeout_s: float | None = None,
     ) -> Gated:
         """Which of the candidate factors are plausible, at a gate that a right one passes with `probability`."""
         return self.ask.gate(factors_of(candidates), probability, timeout_s).result()
 
-    def gain(self, candidates: Batch | Draft | Sequence[Factors], timeout_s: float | None = None) -> Gained:
+    def gain(self, candidates: Batch | Draft | Sequence[Factors], *, timeout_s: float | None = None) -> Gained:
         """How many nats of information each candidate factor would bring by itself, whatever it measures."""
         return self.ask.gain(factors_of(candidates), timeout_s).result()
 

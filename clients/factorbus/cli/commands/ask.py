@@ -198,7 +198,7 @@ def chi2_command(address: MapAddress, batch: bool, as_json: bool) -> int:
     factorbus ask chi2 warehouse --batch
     """
     with _map(address) as joined:
-        found = joined.chi2(batch, address.timeout_s)
+        found = joined.chi2(batch, timeout_s=address.timeout_s)
     if as_json:
         content = {"revision": found.revision, "chi2": found.chi2}
         if found.batch is not None:

@@ -29,7 +29,7 @@ def suspects_command(address: MapAddress, every: bool, as_json: bool) -> int:
     from factorbus.proto.symbols import format_symbol
 
     with joined_map(address, "ask") as joined:
-        found = joined.suspects(every, address.timeout_s)
+        found = joined.suspects(every, timeout_s=address.timeout_s)
     listed = [
         {
             "factor": factor,
