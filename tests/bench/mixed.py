@@ -233,22 +233,20 @@ def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         rounds = max(options.rounds or round(60 * options.minutes / options.round_s), 2)
         for number in range(rounds):
             _round(service.endpoint, options, options.seed + 1000 * number, (done, codes, faults))
-            last = number == rounds - 1
+            if number == rounds - 1:
+                break
             with connect(service.endpoint, client="keeper", timeout_s=_PATIENCE_S) as bus:
-                if last:
-                    at_rest(bus)
-                    before = estimates(bus)
-                    service.kill()
-                    service.again()
-                else:
-                    for row in bus.maps():
-                        bus.drop(row.name, timeout_s=_PATIENCE_S)
-            if last:
-                with connect(service.endpoint, client="keeper", timeout_s=_PATIENCE_S) as bus:
-                    after = estimates(bus)
-            else:
-                has.append(service.has())
-                print(f"round {number}: {has[-1]}, {sum(done.values())} done", file=sys.stderr, flush=True)
+                for row in bus.maps():
+                    bus.drop(row.name, timeout_s=_PATIENCE_S)
+            has.append(service.has())
+            print(f"round {number}: {has[-1]}, {sum(done.values())} done", file=sys.stderr, flush=True)
+        with connect(service.endpoint, client="keeper", timeout_s=_PATIENCE_S) as bus:
+            at_rest(bus)
+            before = estimates(bus)
+            service.kill()
+            service.again()
+        with connect(service.endpoint, client="keeper", timeout_s=_PATIENCE_S) as bus:
+            after = estimates(bus)
     memory = [each["memory"] for each in has]
     third = max(len(memory) // 3, 1)
     return {

@@ -44,6 +44,7 @@ def test_every_steps_estimate_reaches_everybody_and_is_as_good_as_a_batch(world:
     assert set(found["processes"]) == {"solver", "robot", "worker1", "worker2"}
     assert len(set(found["processes"].values()) | {os.getpid()}) == 5
     assert (tmp_path / found["plot"]).read_bytes().startswith(b"\x89PNG")
+    assert found["written"] == [found["plot"]]
     assert "300/300" in ran.stderr
 
 

@@ -55,6 +55,27 @@ def test_wrong_use_is_a_document(words: tuple[str, ...], first: bool, capsys: py
     wanted = "Missing argument" if words == ("budget",) else "--nope"
     assert wanted in problem["message"]
     assert wanted in said.err
+    assert problem["detail"]["usage"] in said.err
+
+
+@pytest.mark.parametrize(
+    ("typed", "detail"),
+    [
+        (["ask", "yard"], {"commands": "chi2 components covariance gain gate repair suspects why".split()}),
+        (["ask", "covariance", "yard", "--jont"], {"nearest": ["--connect", "--joint", "--json"]}),
+        (["replay", "-5"], {"hint": "A number below 0 is written behind `--`, and options before that: NAME -- -1"}),
+        (["sove", "a.g2o"], {"usage": "Usage: factorbus [OPTIONS] COMMAND [ARGS]..."}),
+    ],
+)  # fmt: skip
+def test_the_document_of_wrong_use_has_what_the_text_has(
+    typed: list[str], detail: dict[str, object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*typed, "--json"]) == USAGE
+    said = capsys.readouterr()
+    problem = json.loads(said.out)["problem"]
+    assert problem["detail"].items() >= detail.items()
+    assert problem["message"] in said.err
+    assert problem["detail"].get("hint", "") in said.err
 
 
 def test_without_json_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:

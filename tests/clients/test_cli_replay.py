@@ -136,6 +136,28 @@ def test_a_map_that_is_not_empty_is_refused(endpoint: str, town: Path) -> None:
     assert re.search(r"is at revision \d+ already", ran.stderr)  # further steps count too
 
 
+def test_what_was_written_where_is_said(town: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    files = {name: tmp_path / f"town.{name}" for name in ("pyfg", "tum", "kitti", "png")}
+    options = {"--out": "pyfg", "--tum": "tum", "--kitti": "kitti", "--plot": "png"}
+    asked = [word for option, name in options.items() for word in (option, str(files[name]))]
+    assert main(["replay", str(town), "--in-process", *asked, "--json"]) == OK
+    said = capfd.readouterr()
+    told = json.loads(said.out)
+    assert told["written"] == [str(path) for path in files.values()]
+    assert told["left_out"] == {"fixed variables": 1}
+    assert told["notes"] == [
+        "1 fixed variable written as free: PyFactorGraph (.pyfg) does not say which variables are fixed"
+    ]
+    for name, what in (
+        ("pyfg", "the map"),
+        ("tum", "the trajectory"),
+        ("kitti", "the trajectory"),
+        ("png", "the picture"),
+    ):
+        assert f"{files[name]}: {what} written" in said.err
+        assert files[name].stat().st_size > 0
+
+
 def test_what_a_person_sees(town: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(town), "--in-process"]) == OK
     shown = capfd.readouterr()

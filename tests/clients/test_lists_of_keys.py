@@ -35,7 +35,7 @@ def test_keys_one_by_one_are_refused_with_the_list_that_is_meant(name: str) -> N
         call(Uncertainty(QUESTIONS))
     assert said in refused.value.message
     with pytest.raises(BadShape) as refused:
-        asyncio.run(call(AioUncertainty(None)))  # type: ignore[arg-type]
+        asyncio.run(call(AioUncertainty(QUESTIONS)))
     assert said in refused.value.message
 
 

@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         error.show()
         if as_json:
-            document({"problem": {"code": "bad_usage", "message": error.format_message(), "detail": {}}})
+            document({"problem": {"code": "bad_usage", "message": error.format_message(), "detail": _detail(error)}})
         if hint := _hint(error):
             click.echo(hint, err=True)
         return USAGE
@@ -137,6 +137,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return report(Stopped("cannot_write", f"standard output cannot be written: {error.strerror}"), False, debug)
     except Exception as error:
         return report(error, as_json=as_json, debug=debug)
+
+
+def _detail(error: click.ClickException) -> dict[str, str | list[str]]:
+    """What the text says beside the message: how the command is called, which there are, what was meant."""
+    ctx = error.ctx if isinstance(error, click.UsageError) else None
+    told: dict[str, str | list[str]] = {"usage": ctx.get_usage()} if ctx else {}
+    if ctx and isinstance(ctx.command, click.Group):
+        told["commands"] = ctx.command.list_commands(ctx)
+    if isinstance(error, click.NoSuchOption) and error.possibilities:
+        told["nearest"] = sorted(error.possibilities)
+    if hint := _hint(error):
+        told["hint"] = hint
+    return told
 
 
 def _hint(error: click.ClickException) -> str:

@@ -135,7 +135,7 @@ def run_demo(request: DemoRequest) -> dict[str, Any]:
         "processes": processes,
         "plot": str(request.plot),
     }
-    _write(request, estimate, world.truth)
+    written = _write(request, estimate, world.truth)
     subtitle = (
         f"{counted(result['poses'], 'pose')}, χ² {result['chi2']:.6g}, {_metres(result['error_m'])} from the truth"
     )
@@ -144,18 +144,23 @@ def run_demo(request: DemoRequest) -> dict[str, Any]:
         draw(
             request.plot, world.batches, estimate, history, f"{request.world}, as the bus saw it", subtitle, world.truth
         )
-    return result
+    return result | {"written": [*written, str(request.plot)]}
 
 
-def _write(request: DemoRequest, estimate: Any, truth: Any) -> None:
-    """The trajectories that were asked for."""
+def _write(request: DemoRequest, estimate: Any, truth: Any) -> list[str]:
+    """The trajectories that were asked for; says which is where."""
+    from factorbus.cli.output.console import print_note
     from factorbus.formats import write_tum
     from factorbus.proto.messages import Batch
 
-    for path, variables in ((request.tum, estimate), (request.truth, truth)):
+    asked = ((request.tum, estimate, "the estimated trajectory"), (request.truth, truth, "where the robot really was"))
+    files = list[str]()
+    for path, variables, what in asked:
         if path:
             with output_file(path):
-                write_tum(path, Batch(tuple(variables)))
+                files += map(str, write_tum(path, Batch(tuple(variables))))
+            print_note(f"{path}: {what}, written")
+    return files
 
 
 def _look_on(request: DemoRequest, solver: Any, robot: Any, viewer: Any) -> None:

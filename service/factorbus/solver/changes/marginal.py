@@ -15,15 +15,11 @@ from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, of_whole_factors
 from factorbus.solver.graph.groups import FactorGroup
+from factorbus.solver.graph.linearized import JACOBIAN_ROUNDING
 from factorbus.solver.graph.whitened import Whitened, kind_of, whitened
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import POSE
-
-# Of the square root of what is known: a scalar of which no more than this is left beside what goes is not known at all,
-# nor is a direction, in columns of length 1, beside the best known one.  Λ in doubles has no more, and Jacobians of a
-# map that lies some thousand kilometres from its origin are 10⁻⁹ off.
-_NOTHING = 1e-8
 
 
 def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[FactorGroup], list[int]]:
@@ -98,12 +94,13 @@ def reduced(graph: FactorGraph, whole: Whitened, count: int) -> tuple[F64, F64]:
     largest = np.abs(stacked[:, :n]).max(1, initial=0.0)
     R = np.asarray(np.linalg.qr(stacked[np.argsort(-largest, kind="stable")], mode="r"))
     length = np.sqrt((J * J).sum(0))
-    if (np.abs(R.diagonal()[:cut]) <= _NOTHING * length[:cut]).any():
+    # A scalar of which no more is left beside what goes is not known at all.
+    if (np.abs(R.diagonal()[:cut]) <= JACOBIAN_ROUNDING * length[:cut]).any():
         key, factors = int(graph.keys[whole.variables[0]]), graph.factors_of(whole.variables[0])
         raise errors.Underconstrained(key, factors, "its own factors leave it free; it cannot be marginalized")
     left = R[cut:n, cut:]
     # Of a scalar that is known only with what goes, nothing is left but rounding.
-    left[:, :-1][:, np.sqrt((left[:, :-1] ** 2).sum(0)) <= _NOTHING * length[cut:]] = 0.0
+    left[:, :-1][:, np.sqrt((left[:, :-1] ** 2).sum(0)) <= JACOBIAN_ROUNDING * length[cut:]] = 0.0
     return left[:, :-1], left[:, -1]
 
 
@@ -129,7 +126,7 @@ def _of_full_rank(R: F64, d: F64) -> tuple[F64, F64]:
     # Without units: what is known of an angle and of a place differ by as much as their scales.
     D = np.sqrt((R * R).sum(0))
     U, values, V = np.linalg.svd(R / np.where(D > 0.0, D, 1.0), full_matrices=False)
-    known = values > _NOTHING * values.max(initial=0.0)
+    known = values > JACOBIAN_ROUNDING * values.max(initial=0.0)
     Q, R = np.linalg.qr(values[known, None] * V[known] * D)
     return np.triu(R), Q.T @ (U[:, known].T @ d)
 

@@ -11,6 +11,10 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.candidates import evaluate_factors, evaluate_many
 
+# Of the largest numbers of Jacobians, what may be rounding in the others: of a map that lies some thousand kilometres
+# from its origin they are 10⁻⁹ off, and Λ in doubles has no more.
+JACOBIAN_ROUNDING = 1e-8
+
 
 @dataclass(frozen=True, slots=True)
 class Linearized:

@@ -8,13 +8,10 @@ import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, of_whole_factors
-from factorbus.solver.graph.linearized import Linearized, linearized_factor
+from factorbus.solver.graph.linearized import JACOBIAN_ROUNDING, Linearized, linearized_factor
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
-# Of the longest row of a factor, what may be rounding: Jacobians of a map that lies some thousand kilometres from its
-# origin are 10⁻⁹ off.
-_NOTHING = 1e-8
 # The least eigenvalue of JᵀJ, columns of J scaled to length 1, with which a dense solve has a digit or two left.
 LEAST_EIGENVALUE = 1e-13
 # One of no more is nothing but rounding, whatever the rows weigh.
@@ -103,5 +100,5 @@ def _scaled(factor: Linearized, wanted: np.ndarray, is_linear: bool) -> F64:
     whole = np.linalg.cholesky(factor.W / D / D[:, None]).T @ factor.J
     J, longest = whole[:, wanted], np.sqrt((whole * whole).sum(1).max())
     length = np.sqrt((J * J).sum(1))
-    none = length <= _NOTHING * longest
+    none = length <= JACOBIAN_ROUNDING * longest
     return np.where(none[:, None], 0.0, J / np.where(none, 1.0, longest if is_linear else length)[:, None])
