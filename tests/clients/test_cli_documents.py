@@ -61,7 +61,8 @@ def test_wrong_use_is_a_document(words: tuple[str, ...], first: bool, capsys: py
 @pytest.mark.parametrize(
     ("typed", "detail"),
     [
-        (["ask", "yard"], {"commands": "chi2 components covariance gain gate repair suspects why".split()}),
+        (["change", "yard"], {"usage": "Usage: factorbus change [OPTIONS] COMMAND [ARGS]..."}),
+        (["plot", "a.g2o"], {"commands": ["drive", "map", "sparsity", "tree"]}),
         (["ask", "covariance", "yard", "--jont"], {"nearest": ["--connect", "--joint", "--json"]}),
         (["replay", "-5"], {"hint": "A number below 0 is written behind `--`, and options before that: NAME -- -1"}),
         (["sove", "a.g2o"], {"usage": "Usage: factorbus [OPTIONS] COMMAND [ARGS]..."}),
