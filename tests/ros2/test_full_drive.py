@@ -165,7 +165,7 @@ def test_a_script_writes_it_and_one_command_makes_a_picture_and_a_trajectory(
     document = json.loads(told.out)
     short = len(keyframes(full_drive.full_drive(40)))
     assert document["poses"] == short
-    assert document["written"] == ["drive.tum"]
+    assert document["written"] == ["drive.tum", "drive.png"]
     assert document["chi2_initial"] is None, "velocities that the IMU alone composes are no odometry"
     rows = np.loadtxt(tmp_path / "drive.tum")
     assert rows.shape == (short, 8)

@@ -6,7 +6,7 @@ COLMAP's models and of nuScenes are read, g2o, PyFactorGraph, JRL, TUM and KITTI
 
 from factorbus.formats.errors import FormatError
 from factorbus.formats.graph import GraphFile
-from factorbus.formats.left_out import Notes
+from factorbus.formats.left_out import FileNotes
 from factorbus.formats.loop_list import with_loops
 from factorbus.formats.numbering import IDS
 from factorbus.formats.read_glim import is_glim
@@ -27,9 +27,9 @@ __all__ = [
     "IDS",
     "READS",
     "FactorLabels",
+    "FileNotes",
     "FormatError",
     "GraphFile",
-    "Notes",
     "RobotLog",
     "Steps",
     "Written",

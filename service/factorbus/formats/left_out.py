@@ -13,19 +13,19 @@ from factorbus.wording import counted
 _SHOWN = 5
 
 
-class Notes(tuple[str, ...]):
+class FileNotes(tuple[str, ...]):
     """What was left out of a file, a sentence for each reason, for people; counts: the same by name, for programs."""
 
     counts: dict[str, int]
 
-    def __new__(cls, notes: Iterable[str] = (), counts: Mapping[str, int] | None = None) -> "Notes":
+    def __new__(cls, notes: Iterable[str] = (), counts: Mapping[str, int] | None = None) -> "FileNotes":
         made = super().__new__(cls, notes)
         made.counts = dict(counts or {})
         return made
 
-    def and_those(self, more: "Notes") -> "Notes":
+    def and_those(self, more: "FileNotes") -> "FileNotes":
         """Of two files, or of two looks at one: counts add up."""
-        return Notes((*self, *more), Counter(self.counts) + Counter(more.counts))
+        return FileNotes((*self, *more), Counter(self.counts) + Counter(more.counts))
 
 
 # Names that are nouns have a singular; names of records and kinds do not.
@@ -87,9 +87,9 @@ class LeftOut:
             self.counts[name] = self.counts.get(name, 0) + count
             self.notes.append(f"{_counted(count, name)} written {into}: {why}")
 
-    def told(self) -> Notes:
+    def told(self) -> FileNotes:
         """All of it."""
-        return Notes(self.notes, self.counts)
+        return FileNotes(self.notes, self.counts)
 
     def say(self, note: str) -> None:
         """Nothing is left out, but somebody may want to know."""

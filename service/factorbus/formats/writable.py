@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.formats.errors import FormatError
-from factorbus.formats.left_out import LeftOut, Notes, shown
+from factorbus.formats.left_out import FileNotes, LeftOut, shown
 from factorbus.formats.weights import has_covariance
 from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS, name_of_kind
@@ -30,7 +30,7 @@ class Written:
     """The text of a file; notes: what was left out of it."""
 
     text: str
-    notes: Notes
+    notes: FileNotes
 
     @property
     def left_out(self) -> dict[str, int]:

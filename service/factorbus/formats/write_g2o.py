@@ -6,7 +6,7 @@ from typing import TextIO
 
 import numpy as np
 
-from factorbus.formats.left_out import LeftOut, Notes
+from factorbus.formats.left_out import FileNotes, LeftOut
 from factorbus.formats.numbering import numbered
 from factorbus.formats.records import G2O, Edge
 from factorbus.formats.whole_file import write_whole
@@ -26,7 +26,7 @@ _FORM = Form("g2o", frozenset(_VERTEX_NAMES), {kind: record.measured for kind, (
 
 def write_g2o(
     path_or_file: str | os.PathLike[str] | TextIO, batch: Batch, strict: bool = False, ids: str = "auto"
-) -> Notes:
+) -> FileNotes:
     """Write `batch` to a path or an open text file, as `as_g2o` makes it; returns its notes.  Raises FormatError."""
     written = as_g2o(batch, strict, ids)
     if isinstance(path_or_file, str | os.PathLike):

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from factorbus.formats.errors import FormatError
-from factorbus.formats.left_out import LeftOut, Notes
+from factorbus.formats.left_out import FileNotes, LeftOut
 from factorbus.formats.robot_log import RobotLog
 from factorbus.formats.write_g2o import write_g2o
 from factorbus.formats.write_jrl import CBOR, write_jrl
@@ -16,7 +16,7 @@ GRAPHS = (".g2o", ".pyfg", ".jrl", CBOR)  # CBOR: a JRL, coded so
 
 def write_graph(
     path: str | os.PathLike[str], batch: Batch, strict: bool = False, ids: str = "auto", log: RobotLog | None = None
-) -> Notes:
+) -> FileNotes:
     """Write `batch`, and what a JRL has beside it; returns what was left out, for people.  Raises FormatError.
 
     ids: of a .g2o (`write_g2o`).  log: what is known beside the graph; only a JRL has a place for it.

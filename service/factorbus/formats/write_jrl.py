@@ -18,7 +18,7 @@ from factorbus.formats.bearing_ranges import bearings_of_positions
 from factorbus.formats.cbor import as_cbor
 from factorbus.formats.errors import FormatError
 from factorbus.formats.jrl import BEARING_RANGE_3D, FACTORS, GTSAM_ORDER, JRL, VALUES, as_measured, as_value
-from factorbus.formats.left_out import LeftOut, Notes
+from factorbus.formats.left_out import FileNotes, LeftOut
 from factorbus.formats.outlier_labels import OUTLIERS, POTENTIAL_OUTLIERS
 from factorbus.formats.robot_log import RobotLog, first_mentions
 from factorbus.formats.weights import doubled_rotations, inverted_weights, unpacked_symmetric
@@ -56,7 +56,9 @@ class _Measurement:
     outlier: bool = False
 
 
-def write_jrl(path: str | os.PathLike[str], batch: Batch, strict: bool = False, log: RobotLog | None = None) -> Notes:
+def write_jrl(
+    path: str | os.PathLike[str], batch: Batch, strict: bool = False, log: RobotLog | None = None
+) -> FileNotes:
     """Write `batch` to a path, as `as_jrl` makes it, in CBOR for .cbor; returns its notes.  Raises FormatError."""
     left = LeftOut(JRL, strict)
     document = _document(batch, log, Path(path).stem.removesuffix(f".{JRL}"), left)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from factorbus.formats.left_out import LeftOut, Notes
+from factorbus.formats.left_out import FileNotes, LeftOut
 from factorbus.formats.pyfg import FACTORS, PYFG, RANGE, RANGES, VERTICES
 from factorbus.formats.seconds import seconds_text
 from factorbus.formats.weights import doubled_rotations, inverted_weights
@@ -33,7 +33,7 @@ _FORM = Form(
 )
 
 
-def write_pyfg(path: str | os.PathLike[str], batch: Batch, strict: bool = False) -> Notes:
+def write_pyfg(path: str | os.PathLike[str], batch: Batch, strict: bool = False) -> FileNotes:
     """Write `batch` to a path, as `as_pyfg` makes it; returns its notes.  Raises FormatError."""
     written = as_pyfg(batch, strict)
     write_whole(path, written.text, encoding="ascii")

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from factorbus.formats.left_out import Notes
+from factorbus.formats.left_out import FileNotes
 from factorbus.formats.seconds import seconds_text
 from factorbus.formats.trajectory import (
     Stamped,
@@ -31,11 +31,11 @@ def tum_text(batch: Batch, robot: str | None = None) -> str:
     return _text(one_trajectory(batch, "TUM", robot))
 
 
-def tum_notes(batch: Batch, robot: str | None = None) -> Notes:
+def tum_notes(batch: Batch, robot: str | None = None) -> FileNotes:
     """What `write_tum` leaves out of the file of `robot`, or of all, for people.  Raises as it does."""
     chosen = trajectories(batch, "TUM").values() if robot is None else [one_trajectory(batch, "TUM", robot)]
     left = len([row for rows in chosen for row in untimed(rows)])
-    return Notes((note for rows in chosen if (note := untimed_note(rows))), {"poses": left} if left else {})
+    return FileNotes((note for rows in chosen if (note := untimed_note(rows))), {"poses": left} if left else {})
 
 
 def _text(rows: list[Stamped]) -> str:

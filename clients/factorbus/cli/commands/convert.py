@@ -22,7 +22,7 @@ from factorbus.cli.process.reading import (
 from factorbus.wording import counted
 
 if TYPE_CHECKING:
-    from factorbus.formats import GraphFile, Notes
+    from factorbus.formats import FileNotes, GraphFile
 
 _WRITES = (*GRAPHS, ".tum", ".kitti")
 
@@ -140,9 +140,9 @@ def _check_any(graph: "GraphFile", target: Path) -> None:
 
 def _written(
     graph: "GraphFile", target: Path, strict: bool, robot: str | None, ids: str
-) -> tuple[list[Path], "Notes", dict[str, int]]:
+) -> tuple[list[Path], "FileNotes", dict[str, int]]:
     """(the files, what was left out of them, how much is in them).  Raises FormatError, SeveralRobots."""
-    from factorbus.formats import Notes, tum_notes, write_graph, write_kitti, write_tum
+    from factorbus.formats import FileNotes, tum_notes, write_graph, write_kitti, write_tum
     from factorbus.formats.left_out import LeftOut
     from factorbus.formats.trajectory import one_trajectory, trajectories, untimed
 
@@ -160,7 +160,7 @@ def _written(
     if graph.log is not None and graph.log.known:
         left.drop("ground truth values", graph.log.known, "--ground-truth writes them in place of the others")
     left.drop("poses", graph.poses - sum(map(len, chosen)), f"of other robots than {robot!r}")
-    write, notes = (write_tum, tum_notes) if form == "TUM" else (write_kitti, lambda *_: Notes())
+    write, notes = (write_tum, tum_notes) if form == "TUM" else (write_kitti, lambda *_: FileNotes())
     untold = sum(len(untimed(rows)) for rows in chosen) if form == "TUM" else 0
     written = {"poses": sum(map(len, chosen)) - untold, "landmarks": 0, "factors": 0}
     return write(target, graph.batch, robot), left.told().and_those(notes(graph.batch, robot)), written

@@ -58,7 +58,7 @@ def command(
     check_chosen(target, robot, ids)
     from factorbus.cli.output.console import document
     from factorbus.cli.process.bus import open_bus
-    from factorbus.formats import Notes, recoded, write_whole
+    from factorbus.formats import FileNotes, recoded, write_whole
 
     form = "jrl" if target.suffix in ROBOT_LOGS else target.suffix.removeprefix(".")
     with open_bus(endpoint, "save", zenoh, timeout_s) as bus, bus.map(name, mirror=False, create=False) as joined:
@@ -68,14 +68,14 @@ def command(
             if robots
             else {"": joined.ask.export(form, timeout_s, ids=ids or "auto").result()}
         )
-    files, notes = [], Notes()
+    files, notes = [], FileNotes()
     for letter, exported in texts.items():
         path = target if len(texts) == 1 else target.with_name(f"{target.stem}-{letter or 'none'}{target.suffix}")
         with output_file(path):
             write_whole(path, recoded(exported.text) if path.suffix == ".cbor" else exported.text)
         files.append(str(path))
         say(path, exported.notes)
-        notes = notes.and_those(Notes(exported.notes, exported.left_out))
+        notes = notes.and_those(FileNotes(exported.notes, exported.left_out))
         if not as_json:
             click.echo(path)
     if as_json:

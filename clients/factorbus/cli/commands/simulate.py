@@ -57,10 +57,10 @@ def command(
     from factorbus.cli.driving.columns import merged
     from factorbus.cli.output import console as screen
     from factorbus.cli.process.reading import ROBOT_LOGS, say, told_of
-    from factorbus.formats import Notes, RobotLog, write_graph, write_tum
+    from factorbus.formats import FileNotes, RobotLog, write_graph, write_tum
     from factorbus.proto.messages import Batch
 
-    batches, truths, notes = [], [], Notes()
+    batches, truths, notes = [], [], FileNotes()
     with screen.progress(world, poses) as show:
         for number, step in enumerate(_steps(world, poses, seed), 1):
             batches.append(step.batch)

@@ -10,7 +10,7 @@ from factorbus.cli.process.reading import ROBOT_LOGS, say
 from factorbus.wording import counted
 
 if TYPE_CHECKING:
-    from factorbus.formats import Notes
+    from factorbus.formats import FileNotes
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,14 +35,14 @@ class ReplayedDrive:
     truth: Any
 
 
-def write_files(asked: AskedFiles, title: str, drive: ReplayedDrive) -> tuple[list[Path], "Notes"]:
+def write_files(asked: AskedFiles, title: str, drive: ReplayedDrive) -> tuple[list[Path], "FileNotes"]:
     """(the files, what was left out of them).  Raises Stopped, FormatError."""
     from factorbus.cli.driving.places import places_only
     from factorbus.cli.output.console import print_note
-    from factorbus.formats import Notes, tum_notes, write_graph, write_kitti, write_tum
+    from factorbus.formats import FileNotes, tum_notes, write_graph, write_kitti, write_tum
     from factorbus.proto.messages import Batch
 
-    files, notes = list[Path](), Notes()
+    files, notes = list[Path](), FileNotes()
     if asked.out:
         graph, numbering = drive.target.graph(), drive.source.numbering
         ids = numbering if numbering != "ids" else "auto"
@@ -56,7 +56,7 @@ def write_files(asked: AskedFiles, title: str, drive: ReplayedDrive) -> tuple[li
     for path, write, left in ((asked.tum, write_tum, tum_notes), (asked.kitti, write_kitti, None)):
         if path:
             files += _trajectories(path, write, places)
-            untold = left(places) if left else Notes()
+            untold = left(places) if left else FileNotes()
             say(path, untold)
             notes = notes.and_those(untold)
     if asked.plot:

@@ -22,7 +22,7 @@ from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from factorbus.cli.driving.optimum import WorkerCores
-    from factorbus.formats import Notes
+    from factorbus.formats import FileNotes
 
 _START = {"file": "values"}  # the solver's word
 _WORDS = {"values": "file"}
@@ -49,7 +49,7 @@ class SolveRequest:
 def run_solve(request: SolveRequest) -> dict[str, Any]:
     """Do it, with progress on standard error; returns the document.  Raises Stopped, FormatError, SolverError."""
     from factorbus.cli.driving.optimum import WorkerCores, optimum_of, with_loss_on_loops, without_false
-    from factorbus.formats import Notes, write_whole
+    from factorbus.formats import FileNotes, write_whole
     from factorbus.service.process.memory import available
     from factorbus.solver import BatchSearch
 
@@ -87,7 +87,7 @@ def run_solve(request: SolveRequest) -> dict[str, Any]:
     }
     if not found.converged:
         print_note(f"{NOT_CONVERGED}; --max-iterations, or another --start")
-    written, notes = _write(request.out, solved, source, request.strict) if request.out else ([], Notes())
+    written, notes = _write(request.out, solved, source, request.strict) if request.out else ([], FileNotes())
     if request.covariance is not None:
         rows = _timed(seconds, "covariance", lambda: _covariances(solved, request.covariance))
         if isinstance(request.covariance, Path):
@@ -219,9 +219,9 @@ def _csv(rows: list[tuple[str, str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write(out: Path, graph: Batch, source: Any, strict: bool) -> tuple[list[Path], "Notes"]:
+def _write(out: Path, graph: Batch, source: Any, strict: bool) -> tuple[list[Path], "FileNotes"]:
     """The files, and what was left out of them.  Raises Stopped, FormatError."""
-    from factorbus.formats import Notes, tum_notes, write_graph, write_kitti, write_tum
+    from factorbus.formats import FileNotes, tum_notes, write_graph, write_kitti, write_tum
 
     with output_file(out):
         if out.suffix in GRAPHS:
@@ -232,7 +232,7 @@ def _write(out: Path, graph: Batch, source: Any, strict: bool) -> tuple[list[Pat
         else:
             kitti = out.suffix == ".kitti"
             files = (write_kitti if kitti else write_tum)(out, Batch(graph.variables))
-            notes = Notes() if kitti else tum_notes(graph, None)
+            notes = FileNotes() if kitti else tum_notes(graph, None)
     say(out, notes)
     if files != [out]:
         print_note(f"{out}: one file for each robot: {', '.join(map(str, files))}")

@@ -11,7 +11,7 @@ from factorbus.cli.output.exits import BAD_FILE, Stopped
 
 if TYPE_CHECKING:
     from factorbus.cli.logs.sensor_log import SensorLog
-    from factorbus.formats import GraphFile, Notes
+    from factorbus.formats import FileNotes, GraphFile
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -93,13 +93,13 @@ def is_recording(path: Path) -> bool:
     return (path / _METADATA).is_file() or any(each.suffix in _RECORDINGS[:2] for each in path.iterdir())
 
 
-def told_of(notes: "Notes") -> dict[str, Any]:
+def told_of(notes: "FileNotes") -> dict[str, Any]:
     """For `--json`: what was left out of the files that were written, as `read` says it of one that was read."""
     return {"notes": list(notes), "left_out": dict(notes.counts)}
 
 
 def say(path: Path, notes: tuple[str, ...]) -> None:
-    """Notes on a file, to standard error."""
+    """FileNotes on a file, to standard error."""
     from factorbus.cli.output.console import print_note
 
     for text in notes:

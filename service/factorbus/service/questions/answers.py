@@ -31,7 +31,7 @@ from factorbus.solver.changes.repair import repair
 from factorbus.solver.errors import SolverError
 
 if TYPE_CHECKING:
-    from factorbus.formats import Notes
+    from factorbus.formats import FileNotes
 
 _GRAPHS, _TRAJECTORIES = ("g2o", "pyfg", "jrl"), ("tum", "kitti")
 _IDS = ("auto", "ids", "keys", "counted")
@@ -313,10 +313,10 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
     return tuple(chosen)
 
 
-def _text(question: Question, batch: Batch) -> tuple[str, "Notes"]:
+def _text(question: Question, batch: Batch) -> tuple[str, "FileNotes"]:
     """(the file, what was left out of it).  Raises FormatError, SeveralRobots."""
     # Only who asks for an export pays for it.
-    from factorbus.formats import Notes, as_g2o, as_jrl, as_pyfg, kitti_text, tum_notes, tum_text
+    from factorbus.formats import FileNotes, as_g2o, as_jrl, as_pyfg, kitti_text, tum_notes, tum_text
 
     if question.format in _GRAPHS:
         strict = question.strict
@@ -327,4 +327,4 @@ def _text(question: Question, batch: Batch) -> tuple[str, "Notes"]:
         return written.text, written.notes
     if question.format == "tum":
         return tum_text(batch, question.robot), tum_notes(batch, question.robot)
-    return kitti_text(batch, question.robot), Notes()
+    return kitti_text(batch, question.robot), FileNotes()
