@@ -75,7 +75,7 @@ def test_poses_are_marginalized_from_a_shell(endpoint: str, capsys: pytest.Captu
         assert (told["removed_variables"], told["added_factors"], told["removed_factors"]) == (2, 1, 4)
         np.testing.assert_allclose(lean.estimate["x5"], before, atol=1e-9)
         np.testing.assert_allclose(lean.uncertainty.joint(["x3", "x5"]), sure, rtol=1e-6)
-        assert lean.graph().batch.factors[-1].kind == "linear_5_se2_point2_se2"
+        assert lean.graph().batch.factors[-1].kind == "linear_5_point2_se2_se2"
         said = shown(capsys, endpoint, "change", "marginalize", "lean", "x4")
         assert "added factors" in said
     shown(capsys, endpoint, "change", "marginalize", "lean", "x99", code=REFUSED)

@@ -126,3 +126,18 @@ def test_beside_fixed_landmarks_and_many_fixed_poses(endpoint: str) -> None:
         map_.change(Changes().marginalize("x0"))
         np.testing.assert_allclose(map_.uncertainty.joint(["x1"]), sure, rtol=1e-6)
         assert [held for _, held, _ in told(map_) if "fixed" not in held] == [{"linear_3_se2": 1}]
+
+
+def test_what_a_fixed_pose_is_known_by_is_a_constant_that_does_not_grow(endpoint: str) -> None:
+    """GNSS at poses that go says that a fixed pose is elsewhere: no step can change that, and χ² leaves it out."""
+    with connect(endpoint, timeout_s=60) as bus, bus.map("window") as window:
+        window.insert(chain("se2", "x", 3))
+        for n in range(3, 40):
+            step = Draft().se2(f"x{n}").between_se2(f"x{n - 1}", f"x{n}", STEPS["se2"], sigmas=SIGMAS["se2"])
+            window.insert(step.position_se2(f"x{n}", (50 + n, 50), sigmas=(30, 30)))
+            window.change(Changes().marginalize(f"x{n - 2}"))
+        variables, held, own = told(window)[0]
+        assert (variables, own, len(held)) == (3, False, 3), "x0, x38, x39"
+        before = window.chi2().chi2
+        window.insert(Draft(), settle=True)
+        assert window.chi2().chi2 <= before * (1 + 1e-9) < 50

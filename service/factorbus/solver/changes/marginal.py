@@ -35,7 +35,7 @@ def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[Fac
         whole = whitened(graph, rows, part, fixed)
         separator = whole.variables[len(part) :]
         if separator:
-            made += _as_factors(graph, separator, *reduced(graph, whole, len(part)))
+            made += _as_factors(graph, separator, len(fixed), *reduced(graph, whole, len(part), len(fixed)))
     return made, used
 
 
@@ -83,32 +83,36 @@ def _separator_of(graph: FactorGraph, part: list[int], rows: list[int], gone: I6
     return set(poses) if separator.size and separator.size + len(poses) <= MOST_JOINED else set()
 
 
-def reduced(graph: FactorGraph, whole: Whitened, count: int) -> tuple[F64, F64]:
+def reduced(graph: FactorGraph, whole: Whitened, count: int, held: int = 0) -> tuple[F64, F64]:
     """R, upper triangular, and d: |R δ − d|² is what is left on the separator, but for a constant, with the best δ of
-    the first `count` variables.  (11.4), by Householder transformations, as Λ has lost what R has not."""
+    the first `count` variables.  (11.4), by Householder transformations, as Λ has lost what R has not.
+
+    The last `held` variables are fixed: where they are is part of the constant.
+    """
     J, n = whole.J, whole.J.shape[1]
+    free = whole.starts[whole.variables[-held]] if held else n
     cut = n if count == len(whole.variables) else whole.starts[whole.variables[count]]
     stacked = np.zeros((max(len(J), n), n + 1))
     stacked[: len(J), :n], stacked[: len(J), n] = J, -whole.r
     # The largest first: a transformation that begins with a small row would round what it takes from the others.
-    largest = np.abs(stacked[:, :n]).max(1, initial=0.0)
+    largest = np.abs(stacked[:, :free]).max(1, initial=0.0)
     R = np.asarray(np.linalg.qr(stacked[np.argsort(-largest, kind="stable")], mode="r"))
     length = np.sqrt((J * J).sum(0))
     # A scalar of which no more is left beside what goes is not known at all.
     if (np.abs(R.diagonal()[:cut]) <= JACOBIAN_ROUNDING * length[:cut]).any():
         key, factors = int(graph.keys[whole.variables[0]]), graph.factors_of(whole.variables[0])
         raise errors.Underconstrained(key, factors, "its own factors leave it free; it cannot be marginalized")
-    left = R[cut:n, cut:]
+    left = R[cut:free, cut:]
     # Of a scalar that is known only with what goes, nothing is left but rounding.
     left[:, :-1][:, np.sqrt((left[:, :-1] ** 2).sum(0)) <= JACOBIAN_ROUNDING * length[cut:]] = 0.0
     return left[:, :-1], left[:, -1]
 
 
-def _as_factors(graph: FactorGraph, separator: list[int], R: F64, d: F64) -> list[FactorGroup]:
-    """A factor on the separator with |R δ − d|²; none where it says nothing."""
+def _as_factors(graph: FactorGraph, separator: list[int], held: int, R: F64, d: F64) -> list[FactorGroup]:
+    """A factor on the separator, of which the last `held` are fixed, with |R δ − d|²; none where it says nothing."""
     kinds, keys = [kind_of(graph, v).name for v in separator], graph.keys[separator]
     y = [_value(graph, v) for v in separator]
-    R, d = _of_full_rank(R, d)
+    R, d = _of_full_rank(R, d, sum(kind_of(graph, v).dim for v in separator[: len(separator) - held]))
     if not len(R):
         return []
     if len(separator) == 1 and kinds[0] in ("point2", "point3") and len(R) == len(y[0]):
@@ -121,14 +125,19 @@ def _as_factors(graph: FactorGraph, separator: list[int], R: F64, d: F64) -> lis
     return [FactorGroup(of.name, keys[None], np.concatenate([*y, *H, -d])[None], upper[None])]
 
 
-def _of_full_rank(R: F64, d: F64) -> tuple[F64, F64]:
-    """R (rank, n), upper triangular, and d that say the same, without directions of which nothing is known."""
+def _of_full_rank(R: F64, d: F64, free: int) -> tuple[F64, F64]:
+    """R (rank, n), upper triangular, and d that say the same, without directions of which nothing is known.
+
+    free: columns of what is not fixed, by which alone it is told.
+    """
     # Without units: what is known of an angle and of a place differ by as much as their scales.
+    R, of_fixed = R[:, :free], R[:, free:]
     D = np.sqrt((R * R).sum(0))
     U, values, V = np.linalg.svd(R / np.where(D > 0.0, D, 1.0), full_matrices=False)
     known = values > JACOBIAN_ROUNDING * values.max(initial=0.0)
     Q, R = np.linalg.qr(values[known, None] * V[known] * D)
-    return np.triu(R), Q.T @ (U[:, known].T @ d)
+    to_known = Q.T @ U[:, known].T
+    return np.hstack([np.triu(R), to_known @ of_fixed]), to_known @ d
 
 
 def _value(graph: FactorGraph, v: int) -> F64:

@@ -38,13 +38,12 @@ class Whitened:
 
 
 def whitened(graph: FactorGraph, rows: Iterable[int], first: list[int], fixed: Collection[int] = ()) -> Whitened:
-    """Of the factors `rows`; the variables `first` come first, behind them the others on these factors, ascending.
-
-    Of the others those that are free, and of fixed ones those in `fixed`.
-    """
+    """Of the factors `rows`; the variables `first` come first, behind them the others on these factors that are free,
+    ascending, and last those of them that are in `fixed`."""
     rows = list(rows)
     ends = {v for row in rows for v in graph.ends_of(row)} - set(first)
-    variables = [*first, *sorted(v for v in ends if graph.var[v, at.V_COLUMN] >= 0 or v in fixed)]
+    free = {v for v in ends if graph.var[v, at.V_COLUMN] >= 0}
+    variables = [*first, *sorted(free), *sorted((ends - free).intersection(fixed))]
     starts, size = {}, 0
     for v in variables:
         starts[v], size = size, size + kind_of(graph, v).dim
