@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+from hypothesis import strategies as st
 
 from factorbus.journal import chain
 from factorbus.journal.records import JournalRecord, Last
@@ -41,8 +42,18 @@ def right(k: int, length: int) -> Factors:
     return between(k, 2 * length + 1 - k, [0.0, 0.0, math.pi])
 
 
-def new_solver() -> MapSolver:
-    return make_map_solver("bayes-tree", {"closures": "test"}, 5, Limits())
+def ids(*numbers: int) -> np.ndarray:
+    return np.array(numbers, np.int64)
+
+
+@st.composite
+def happenings(draw: st.DrawFn) -> list[tuple[str, int, float]]:
+    kinds = st.sampled_from(["right", "right", "false", "false", "accept", "reject", "remove", "drop", "keep", "kill"])
+    return draw(st.lists(st.tuples(kinds, st.integers(0, 30), st.floats(-3.0, 3.0)), min_size=3, max_size=14))
+
+
+def new_solver(policy: str = "test") -> MapSolver:
+    return make_map_solver("bayes-tree", {"closures": policy}, 5, Limits())
 
 
 class TestedMap:
@@ -50,8 +61,9 @@ class TestedMap:
 
     __test__ = False
 
-    def __init__(self) -> None:
-        self.solver, self.records, self.last = new_solver(), list[JournalRecord](), Last(0, 0, chain.START)
+    def __init__(self, policy: str = "test") -> None:
+        self.policy = policy
+        self.solver, self.records, self.last = new_solver(policy), list[JournalRecord](), Last(0, 0, chain.START)
         self.ids: dict[int, tuple[int, ...]] = {}
         self._number = 0
 
@@ -92,7 +104,7 @@ class TestedMap:
     def kill(self, state: dict[str, Any] | None = None, since: int = 0) -> None:
         """Go on from what the journal has; state: a checkpoint after `since` records."""
         before, held = self.solver.suspects(True), self.content()
-        self.solver = new_solver()
+        self.solver = new_solver(self.policy)
         self.solver.load(state)
         present = self.records[since - 1].chain if since else chain.START
         for record in self.records[since:]:
@@ -106,7 +118,7 @@ class TestedMap:
     def go_back(self) -> None:
         """Apply all records anew without the verdicts, as where a replica puts its own behind others'."""
         own, self.records, self.last = self.records, [], Last(0, 0, chain.START)
-        self.solver = new_solver()
+        self.solver = new_solver(self.policy)
         for record in own:
             inserts = [arrived_again(entry) for entry in record.entries if entry.client != JUDGE]
             made = written(self.last.record + 1, inserts, list(self.solver.apply_again(inserts)), self.last)

@@ -5,10 +5,11 @@
 
 Each draw is a drive through streets drawn anew, pose by pose, or the first poses of a public data set with false
 closures drawn anew, whose own closures count as right; seeds are printed.  Kinds of false closures are in
-`false_closures`.  `test` is `GatedSolver`.  Rivals are the same solver with what comes: `trust` believes everything;
-`huber`, `cauchy` and `dcs` have a loss of one standard deviation on every closure.  `isam2-dcs` and
-`isam2-geman-mcclure` are GTSAM's iSAM2 with its own such losses; `gnc` is its `GncOptimizer`, a batch at every
-hundredth step, of maps in the plane.  These are left out where GTSAM is not installed.  Of each:
+`false_closures`.  `test` is `GatedSolver`; `robust` is `GraduatedSolver`, of which those are in that have a quarter of
+their weight.  Rivals are the same solver with what comes: `trust` believes everything; `huber`, `cauchy` and `dcs` have
+a loss of one standard deviation on every closure.  `isam2-dcs` and `isam2-geman-mcclure` are GTSAM's iSAM2 with its own
+such losses; `gnc` is its `GncOptimizer`, a batch at every hundredth step, of maps in the plane.  These are left out
+where GTSAM is not installed.  Of each:
 
     precision, recall   of the closures that are in at the end, how many are right; of the right ones, how many are in;
                         a loss has all of them in, in part
@@ -40,10 +41,13 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.roles import pick_factors
 from factorbus.solver import Options, Solver
 from factorbus.solver.closures.gated import GatedSolver
+from factorbus.solver.closures.graduated import GraduatedSolver
+from factorbus.solver.closures.ledger import SUSPECT
 
+POLICIES: dict[str, Any] = {"test": GatedSolver, "robust": GraduatedSolver}
 LOSSES = ("huber", "cauchy", "dcs")
 OF_GTSAM = ("isam2-dcs", "isam2-geman-mcclure", "gnc")
-RIVALS = ("trust", *LOSSES, *OF_GTSAM)
+RIVALS = ("robust", "trust", *LOSSES, *OF_GTSAM)
 _EVERY = 100
 PRECISION, RECALL, GROUPED = 0.98, 0.98, 0.95  # the targets, and that of both with grouped ones
 
@@ -57,7 +61,9 @@ def main() -> int:
     parser.add_argument("--shares", default="0.1,0.3,0.5", help="of all closures, the false ones")
     parser.add_argument("--worlds", default="streets", help=f"WORLD,... of {', '.join(WORLDS)}")
     parser.add_argument("--poses", type=int, default=1000)
-    parser.add_argument("--rivals", default="trust,huber,cauchy,dcs", help=f"RIVAL,... of {', '.join(RIVALS)}; or none")
+    parser.add_argument(
+        "--rivals", default="robust,trust,huber,cauchy,dcs", help=f"RIVAL,... of {', '.join(RIVALS)}; or none"
+    )
     parser.add_argument("--json", action="store_true", help="print the rows as JSON")
     told = parser.parse_args()
     first = int(np.random.default_rng().integers(2**31)) if told.seed is None else told.seed
@@ -100,9 +106,9 @@ def _is_met(row: dict[str, Any]) -> bool:
 
 def _drive(drive: DriveWithFalse, name: str) -> dict[str, Any]:
     """One drive with one solver."""
-    gated = GatedSolver(Options()) if name == "test" else None
+    gated = POLICIES[name](Options()) if name in POLICIES else None
     solver = _solver(name)
-    losses = "" if name in ("test", "trust", "gnc") else name.removeprefix("isam2-")
+    losses = "" if name in (*POLICIES, "trust", "gnc") else name.removeprefix("isam2-")
     errors, cpu = list[float](), 0.0
     for k, batch in enumerate(drive.batches, 1):
         given = _with_loss(batch, losses) if losses else batch
@@ -122,11 +128,13 @@ def _drive(drive: DriveWithFalse, name: str) -> dict[str, Any]:
             errors.append(error_of(gated.solver if gated else solver, drive.truth[:k]))
     false = drive.is_false()
     closures = gated.closures if gated else []
-    is_in = np.array([c.is_in for c in closures], bool) if gated else np.ones(false.size, bool)
+    is_in = np.array([c.state != SUSPECT for c in closures], bool) if gated else np.ones(false.size, bool)
     if name == "gnc" and not isinstance(solver, Solver):
         is_in = solver.believed()
     right = ~false
-    delays = np.array([c.changed - c.came for c in closures if c.is_in])[right[is_in]] if gated else np.zeros(1)
+    delays = (
+        np.array([c.changed - c.came for c in closures if c.state != SUSPECT])[right[is_in]] if gated else np.zeros(1)
+    )
     return {
         "errors": np.array(errors), "cpu": cpu, "believed": int(is_in.sum()), "right": int(right.sum()),
         "both": int((is_in & right).sum()), "delays": delays,

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
-from tested_maps import TestedMap, between, corridor, right
+from tested_maps import TestedMap, between, corridor, happenings, ids, right
 
 from factorbus.journal.records import ACCEPTED, REFUSED
 from factorbus.proto.closures import CLOSURE_REASONS, CLOSURE_STATES, ClosureEntry, decode_closure_entry
@@ -28,10 +27,6 @@ def driven(length: int = LENGTH) -> TestedMap:
     for batch in corridor(length):
         made.insert(batch)
     return made
-
-
-def ids(*numbers: int) -> np.ndarray:
-    return np.array(numbers, np.int64)
 
 
 def test_words_of_states_and_reasons_are_those_of_the_wire() -> None:
@@ -292,12 +287,6 @@ def test_a_judge_that_fails_keeps_the_insert_and_is_asked_again_with_the_next_cl
     made.insert(Batch((), (right(3, LENGTH),)))
     assert made.states() == {16: "accepted", 17: "accepted"}
     made.kill()
-
-
-@st.composite
-def happenings(draw: st.DrawFn) -> list[tuple[str, int, float]]:
-    kinds = st.sampled_from(["right", "right", "false", "false", "accept", "reject", "remove", "drop", "keep", "kill"])
-    return draw(st.lists(st.tuples(kinds, st.integers(0, 30), st.floats(-3.0, 3.0)), min_size=3, max_size=14))
 
 
 @settings(max_examples=40, deadline=None)

@@ -24,9 +24,10 @@ from factorbus.solver.closures.evidence import (
 )
 from factorbus.solver.closures.gated import GatedSolver
 from factorbus.solver.closures.judging import CONTRADICTED
-from factorbus.solver.closures.ledger import ACCEPTED, REJECTED, RESTORED, SUSPECT, Closure, NotAClosure
+from factorbus.solver.closures.ledger import ACCEPTED, REJECTED, RESTORED, SUSPECT, Closure
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.motions import inverse_motion, motions_of_poses, tangent_of
+from factorbus.solver.closures.naming import NotAClosure
 from factorbus.solver.closures.numbers import closure_numbers, unsure_where_unknown
 from factorbus.solver.closures.policy import ClosurePolicy
 

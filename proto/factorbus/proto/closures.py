@@ -1,7 +1,7 @@
 """Loop closures that a map tests: what it says of them, and how its verdicts are written down.  Both ways, as bytes.
 
-A map with the policy `test` has a state for each closure.  Its verdicts are entries of its journal, those of the client
-`own_clients.JUDGE`: a name that no client on the bus can have.  Readers raise BadMessage, TooLarge.
+A map with the policy `test` or `robust` has a state for each closure.  Its verdicts are entries of its journal, those
+of the client `own_clients.JUDGE`: a name that no client on the bus can have.  Readers raise BadMessage, TooLarge.
 """
 
 from dataclasses import dataclass, field
@@ -17,10 +17,13 @@ from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, MessageLimits
 from factorbus.proto.problems import BadMessage
 from factorbus.wording import counted
 
-CLOSURE_POLICIES = ("trust", "test")
+CLOSURE_POLICIES = ("trust", "test", "robust")
 CLOSURE_STATES = ("accepted", "suspect", "rejected", "restored")
 # Why a state is what it is.
-CLOSURE_REASONS = ("new", "passed", "agrees", "unsure", "improbable", "rival", "contradicted", "failed", "user")
+CLOSURE_REASONS = (
+    "new", "passed", "agrees", "unsure", "improbable", "rival", "contradicted", "failed", "user",
+    "fits", "graduating", "graduated", "outweighed",
+)  # fmt: skip
 # What the event `closures` says of one that the map has no more, and why: a change named it, or a pose of it went.
 GONE, REMOVED, POSE_GONE = "gone", "removed", "pose_gone"
 
@@ -29,8 +32,9 @@ GONE, REMOVED, POSE_GONE = "gone", "removed", "pose_gone"
 class ClosureEntry:
     """An entry of a journal: what some closures are from now on.  factors (n,): ids; a state and a reason of each.
 
-    distance (n,): d²; chance (n,): the odds that it is false; tried (n,): the newest rival at the last trial, −1:
-    none.  ahead: they are believed, and went in with the step of the insert before.
+    distance (n,): d²; chance (n,): the odds that it is false, with the policy "robust" its weight; tried (n,): the
+    newest rival at the last trial, −1: none.  ahead: they are believed, and went in with the step of the insert before.
+    scale (n,): with the policy "robust", of the loss geman-mcclure that each has from now on; None: they keep theirs.
     """
 
     sequence: int
@@ -41,6 +45,7 @@ class ClosureEntry:
     chance: F64
     tried: I64
     ahead: bool = False
+    scale: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +57,13 @@ class AskSuspects:
 
 @dataclass(frozen=True, slots=True)
 class Suspects:
-    """The answer to ask/suspects: closures that the estimate does not have, or all of them, in the order they came.
+    """The answer to ask/suspects: closures that the estimate does not have, or hardly, or all, in the order they came.
 
     policy: one of CLOSURE_POLICIES; with "trust" there are none.  counts: of all closures, by state.  factors (n,):
     ids; keys (n, 2): the poses they are between; kinds, states, reasons: of each.  distance (n,): d² and chance (n,):
     the odds that it is false, when it was last looked at, NaN before.  came, changed (n,): revisions, when
-    it was inserted, and since when its state is this one.
+    it was inserted, and since when its state is this one.  weight (n,): with the policy "robust", by which its
+    information counts at the estimate when it was last looked at, `chance` is 1 − weight; None with the others.
     """
 
     epoch: int
@@ -73,6 +79,7 @@ class Suspects:
     chance: F64 = field(default_factory=lambda: np.empty(0))
     came: I64 = field(default_factory=lambda: np.empty(0, np.int64))
     changed: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+    weight: F64 | None = None
 
 
 def encode_closure_entry(message: ClosureEntry) -> bytes:
@@ -87,6 +94,7 @@ def encode_closure_entry(message: ClosureEntry) -> bytes:
             "chance": _bytes(message.chance, F8),
             "tried": _bytes(message.tried, I8),
             **({"ahead": True} if message.ahead else {}),
+            **({} if message.scale is None else {"scale": _bytes(message.scale, F8)}),
         }
     )
 
@@ -104,6 +112,7 @@ def decode_closure_entry(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> 
         _numbers(content, "chance", factors.size),
         _integers(content, "tried", factors.size),
         fields.flag("", content, "ahead"),
+        _numbers(content, "scale", factors.size) if "scale" in content else None,
     )
 
 
@@ -134,6 +143,7 @@ def encode_suspects(message: Suspects) -> bytes:
             "chance": _bytes(message.chance, F8),
             "came": _bytes(message.came, I8),
             "changed": _bytes(message.changed, I8),
+            **({} if message.weight is None else {"weight": _bytes(message.weight, F8)}),
         }
     )
 
@@ -157,6 +167,7 @@ def decode_suspects(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Suspe
         chance=_numbers(content, "chance", factors.size),
         came=_integers(content, "came", factors.size),
         changed=_integers(content, "changed", factors.size),
+        weight=_numbers(content, "weight", factors.size) if "weight" in content else None,
     )
 
 

@@ -30,6 +30,7 @@ from factorbus.service.journal.keeping import Keeper, Listener
 from factorbus.service.journal.recovery import Recovered, answers, recover
 from factorbus.service.questions.admin import MadeAs, check_made_as
 from factorbus.service.solving.apply import MapSolver
+from factorbus.service.solving.robust import RobustMapSolver
 from factorbus.service.solving.tested import TestedMapSolver
 from factorbus.solver.build import present_build
 from factorbus.solver.state import FORMAT
@@ -64,9 +65,10 @@ def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: L
         settings = Options.of(**{**options, "mode": mode, "clock": time.perf_counter})
     except BadOption as bad:
         raise JournalOption(str(bad.detail["where"]), bad.message) from None
-    if closures == "test":
+    if closures != "trust":
         own["closures"] = closures
-        return TestedMapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict() | own)
+        kind = RobustMapSolver if closures == "robust" else TestedMapSolver
+        return kind(lambda: Solver(settings), epoch, limits, settings.as_dict() | own)
     return MapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict() | own)
 
 

@@ -25,7 +25,7 @@ from factorbus.proto.own_clients import JUDGE
 from factorbus.service.core.events import Arrived, Verdict
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import message_digest, read_again
-from factorbus.service.solving.tested import entry_again
+from factorbus.service.solving.closure_entries import entry_again
 from factorbus.solver.build import differences, present_build
 from factorbus.solver.errors import Diverged, SolverError
 from factorbus.solver.state import FORMAT

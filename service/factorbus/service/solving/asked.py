@@ -8,13 +8,15 @@ import numpy as np
 from factorbus.proto.messages import Change, Insert
 from factorbus.service.core.events import Arrived
 from factorbus.solver.closures.ledger import (
+    ACCEPTED,
     NO_VERDICTS,
     REJECTED,
     RESTORED,
+    SUSPECT,
     ClosureLedger,
     ClosureVerdicts,
-    SwitchedOff,
 )
+from factorbus.solver.closures.naming import SwitchedOff
 from factorbus.solver.closures.switching import ClosureSwitch, planned_switch
 from factorbus.solver.errors import NamedTwice
 
@@ -32,15 +34,18 @@ class AskedChanges(NamedTuple):
 
 def asked_changes(ledger: ClosureLedger, insert: Arrived, content: Insert) -> AskedChanges:
     """What changes come to in a map with this ledger.  Raises SolverError."""
-    said, left, gone = list[ClosureVerdicts](), list[Change](), set[int]()
+    said, left, gone, freed = list[ClosureVerdicts](), list[Change](), set[int](), list[int]()
     for change in content.changes:
         ids = [] if change.factors is None else change.factors.tolist()
         if change.change in _SAYS:
             said.append(ledger.said(ids, _SAYS[change.change]))
+            freed += _weighed_of(ledger, ids) if change.change == "accept" else []
             continue
         out = [factor for factor in ids if (c := ledger.of_factor.get(factor)) is not None and not c.is_in]
         if out and change.change != "remove_factors":
             raise SwitchedOff(change.change, out[0], ledger.of_factor[out[0]].state)
+        if change.change == "loss" and (own := _weighed_of(ledger, ids)):
+            said.append(ledger.said(own, RESTORED))  # its sender weighs it from now on
         _check_once(change.change, [*gone, *out])
         gone |= set(out)
         if not out or len(out) < len(ids):
@@ -49,9 +54,16 @@ def asked_changes(ledger: ClosureLedger, insert: Arrived, content: Insert) -> As
     switch = planned_switch(ledger, verdicts)
     _check_apart(verdicts, switch, gone, left)
     removals = [Change("remove_factors", removal.factors) for removal in switch.removals]
+    removals += [Change("loss", np.array(freed))] if freed else []
     batch: Any = content.batch._replace(factors=(*content.batch.factors, *switch.additions))
     made = content._replace(batch=batch, changes=(*removals, *left))
     return AskedChanges(insert._replace(content=made), verdicts, switch, gone)
+
+
+def _weighed_of(ledger: ClosureLedger, ids: Sequence[int]) -> list[int]:
+    """Those of them that are in, with a loss by which the map weighs them."""
+    found = (ledger.of_factor.get(factor) for factor in ids)
+    return [c.factor_id for c in found if c is not None and c.is_weighed and c.state in (ACCEPTED, SUSPECT)]
 
 
 def _together(said: Sequence[ClosureVerdicts]) -> ClosureVerdicts:

@@ -20,31 +20,35 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.proto import codec
-from factorbus.proto.arrays import I64
+from factorbus.proto.arrays import F64, I64
 from factorbus.proto.closures import ClosureEntry, Suspects, encode_closure_entry, encode_suspects
-from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Batch, Change, Insert
-from factorbus.proto.own_clients import JUDGE
 from factorbus.service.config import Limits
 from factorbus.service.core.events import (
     Applied,
     Arrived,
     MovedClosure,
     Outcome,
-    ParsedInsert,
     SingleInsertResult,
     Stepped,
     Verdict,
     refusal,
 )
-from factorbus.service.kernels.digest import digest
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.asked import AskedChanges, asked_changes
+from factorbus.service.solving.closure_entries import batch_of_insert, entry_again, is_ahead, verdicts_of_entry
 from factorbus.service.solving.closure_news import forget_gone, moved_closures
 from factorbus.solver.closures.ahead import StagedBatch, enter_closures, stage_with_believed
 from factorbus.solver.closures.judging import COMPARED, ClosureJudge
-from factorbus.solver.closures.ledger import NEW, NO_VERDICTS, SUSPECT, Closure, ClosureLedger, ClosureVerdicts
+from factorbus.solver.closures.ledger import (
+    BELIEVED,
+    NEW,
+    NO_VERDICTS,
+    SUSPECT,
+    Closure,
+    ClosureLedger,
+    ClosureVerdicts,
+)
 from factorbus.solver.closures.loops import SplitFactors, TrustedForest, has_candidates
 from factorbus.solver.closures.switching import note_switch, planned_switch
 from factorbus.solver.errors import SolverError
@@ -68,6 +72,8 @@ class _Testing:
 class TestedMapSolver(MapSolver):
     """As `MapSolver`, of a map whose policy for closures is `test`."""
 
+    POLICY = "test"
+
     def __init__(
         self, make_solver: Callable[[], Any], epoch: int, limits: Limits, options: Mapping[str, Any] | None = None
     ) -> None:
@@ -76,7 +82,7 @@ class TestedMapSolver(MapSolver):
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        self._ledger, self._forest = ClosureLedger(), TrustedForest()
+        self._ledger, self._forest = ClosureLedger(weighs=self.POLICY == "robust"), TrustedForest()
         self._entries = 0  # verdicts that were entered since
         self._left_new = False  # closures came without verdicts on them, as those of a replica that went back
 
@@ -103,7 +109,7 @@ class TestedMapSolver(MapSolver):
             return self.apply(inserts)
         if further or len(inserts) != 1 or inserts[0].is_change or getattr(inserts[0].content, "convert_below", 0.0):
             return super().apply_batch(inserts, further)
-        batch = _batch_of(inserts[0])
+        batch = batch_of_insert(inserts[0])
         if batch is not None and has_candidates(batch):
             return self.apply(inserts)
         came = super().apply_batch(inserts, further)
@@ -119,7 +125,7 @@ class TestedMapSolver(MapSolver):
         for insert, following in zip_longest(inserts, inserts[1:]):
             if insert is ahead:
                 continue  # with the insert before
-            batch = None if insert.is_change else _batch_of(insert)
+            batch = None if insert.is_change else batch_of_insert(insert)
             if not insert.is_change and (batch is None or not has_candidates(batch)):
                 plain.append(insert)
                 continue
@@ -128,7 +134,7 @@ class TestedMapSolver(MapSolver):
             if isinstance(insert.content, ClosureEntry):
                 yield from self._apply_judged(insert, insert.content)
             elif batch is not None:
-                ahead = following if following and _is_ahead(following.content) else None
+                ahead = following if following and is_ahead(following.content) else None
                 yield from self._insert_tested(insert, batch, ahead)
             else:
                 yield from self._change_tested(insert)
@@ -163,11 +169,14 @@ class TestedMapSolver(MapSolver):
 
     def suspects(self, every: bool) -> bytes:
         """The answer to ask/suspects."""
-        listed = [c for c in self._ledger.closures if every or not c.is_in]
-        told = Suspects(
+        listed = [c for c in self._ledger.closures if every or c.state not in BELIEVED]
+        return encode_suspects(self._told(listed))
+
+    def _told(self, listed: Sequence[Closure]) -> Suspects:
+        return Suspects(
             self._epoch,
             self._revision,
-            "test",
+            self.POLICY,
             self._ledger.counts(),
             np.array([c.factor_id for c in listed], np.int64),
             np.array([c.keys for c in listed], np.int64).reshape(-1, 2),
@@ -179,7 +188,6 @@ class TestedMapSolver(MapSolver):
             np.array([c.came for c in listed], np.int64),
             np.array([c.changed for c in listed], np.int64),
         )
-        return encode_suspects(told)
 
     def _applied(self, cpu_s: float) -> Applied:
         return super()._applied(cpu_s)._replace(closures=self._ledger.counts())
@@ -195,14 +203,14 @@ class TestedMapSolver(MapSolver):
         for event in events:
             if isinstance(event, Verdict):
                 for outcome in event.outcomes:
-                    if outcome.first_factor >= 0 and (batch := _batch_of(outcome.insert)) is not None:
+                    if outcome.first_factor >= 0 and (batch := batch_of_insert(outcome.insert)) is not None:
                         self._forest.join(batch)
             yield event._replace(closures=self._ledger.counts()) if isinstance(event, Applied) else event
 
     def _insert_tested(self, insert: Arrived, batch: Batch, entry: Arrived | None) -> Iterator[Verdict | Stepped]:
         """One that may have closures; entry: verdicts that were applied with it, when it is run again."""
-        split = self._forest.split(batch)
-        given = _verdicts_of(entry.content) if entry else NO_VERDICTS if self._replaying else None
+        split = self._split(batch)
+        given = verdicts_of_entry(entry.content) if entry else NO_VERDICTS if self._replaying else None
         (verdict, steps), staged = self._try_tested(insert, _Testing(batch, split, given))
         if staged and staged.verdicts().states and not entry:
             entry = self._entry_of(staged.verdicts(), True)
@@ -215,7 +223,7 @@ class TestedMapSolver(MapSolver):
         if outcome.first_factor < 0:
             self._forest.forget()
         elif staged is not None:
-            new = enter_closures(self._solver, self._ledger, staged, self._revision)
+            new = self._enter_new(staged)
         if entry is not None:
             went_in, moved = isinstance(failed, bytes), moved_closures(c for c in new if c.is_in)
             behind.append(self._entered(entry, moved) if went_in else Verdict((refusal(entry, failed),)))
@@ -224,7 +232,11 @@ class TestedMapSolver(MapSolver):
                 staged is not None and staged.all_in and self._judge.is_settled(self._solver, self._ledger, new)
             )
             judged = [] if self._replaying or is_settled else list(self._judged(new))
-            counted = {**report, "closures": len(new), "suspects": sum(not c.is_in for c in new)}
+            counted = {
+                **self._report_behind(report),
+                "closures": len(new),
+                "suspects": sum(c.state not in BELIEVED for c in new),
+            }
             number = [(insert.sequence, outcome.first_factor)]
             (answer,) = self._messages.write_answers(number, self._epoch, self._revision, counted)
             verdict = verdict._replace(outcomes=(outcome._replace(answer=answer),))
@@ -234,6 +246,15 @@ class TestedMapSolver(MapSolver):
         yield from steps
         if outcome.first_factor >= 0 and (below := getattr(insert.content, "convert_below", 0.0)):
             yield from self._convert_to_points(below)
+
+    def _report_behind(self, report: dict[str, Any]) -> dict[str, Any]:
+        return report
+
+    def _split(self, batch: Batch) -> SplitFactors:
+        return self._forest.split(batch)
+
+    def _enter_new(self, staged: StagedBatch) -> Sequence[Closure]:
+        return enter_closures(self._solver, self._ledger, staged, self._revision)
 
     def _try_tested(self, insert: Arrived, testing: _Testing) -> tuple[Any, StagedBatch | None]:
         """The step of an insert; what came of it, and what was staged of one with closures."""
@@ -277,12 +298,12 @@ class TestedMapSolver(MapSolver):
 
     def _enter(self, verdicts: ClosureVerdicts) -> Generator[Verdict | Stepped, None, bool]:
         """Apply them as an entry that comes behind the insert; gives whether they are."""
-        entry = self._entry_of(verdicts, False)
+        entry = self._entry_of(verdicts)
         return (yield from self._apply_judged(entry, entry.content))
 
-    def _entry_of(self, verdicts: ClosureVerdicts, ahead: bool) -> Arrived:
+    def _entry_of(self, verdicts: ClosureVerdicts, ahead: bool = False, scale: F64 | None = None) -> Arrived:
         self._entries += 1
-        content = ClosureEntry(self._entries, *verdicts, ahead)
+        content = ClosureEntry(self._entries, *verdicts, ahead, scale)
         return entry_again(encode_closure_entry(content), content)
 
     def _entered(self, entry: Arrived, moved: tuple[MovedClosure, ...]) -> Verdict:
@@ -292,7 +313,7 @@ class TestedMapSolver(MapSolver):
         return Verdict((Outcome(entry, answer, first),), self._revision, 1, moved)
 
     def _apply_judged(self, insert: Arrived, content: Any) -> Generator[Verdict | Stepped, None, bool]:
-        verdicts = _verdicts_of(content)
+        verdicts = verdicts_of_entry(content)
         try:
             switch = planned_switch(self._ledger, verdicts)
         except SolverError as problem:
@@ -359,12 +380,7 @@ class TestedMapSolver(MapSolver):
         for change in content.changes:
             for factor in change.factors.tolist() if change.change in ("loss", "weigh") else ():
                 if (c := self._ledger.of_factor.get(factor)) is not None:
-                    self._ledger.of_kind[c.factor.kind].measure(c, graph.factor_named(factor))
-
-
-def entry_again(message: bytes, content: ClosureEntry) -> Arrived:
-    """Verdicts as an entry, which nobody waits for."""
-    return Arrived([], JUDGE, content.sequence, 0, len(message), int(digest(message)), content, 0.0, message)
+                    self._ledger.measure(c, graph.factor_named(factor))
 
 
 def _next_look(looks: Iterator[ClosureVerdicts]) -> ClosureVerdicts | None:
@@ -375,19 +391,3 @@ def _next_look(looks: Iterator[ClosureVerdicts]) -> ClosureVerdicts | None:
     except Exception:
         log.exception("closures are not judged, and stay as they are: the judge failed")
     return None
-
-
-def _is_ahead(content: object) -> bool:
-    return isinstance(content, ClosureEntry) and content.ahead
-
-
-def _verdicts_of(entry: Any) -> ClosureVerdicts:
-    return ClosureVerdicts(*(getattr(entry, name) for name in ClosureVerdicts._fields))
-
-
-def _batch_of(insert: Arrived) -> Batch | None:
-    """What an insert adds; None of one that is wrong."""
-    content = insert.content
-    if isinstance(content, ParsedInsert):
-        return codec.decode_insert(content.message, ANSWER_LIMITS).batch
-    return content.batch if isinstance(content, Insert) else None

@@ -27,7 +27,7 @@ from factorbus.proto import kinds as wire
 from factorbus.solver import errors
 from factorbus.solver.changes.carrying import carry_along
 from factorbus.solver.changes.marginal import marginals
-from factorbus.solver.closures.ledger import NotAClosure
+from factorbus.solver.closures.naming import NotAClosure
 from factorbus.solver.graph.admission import out_of_bounds
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, losses_of, of_whole_factors, rows_of_factors

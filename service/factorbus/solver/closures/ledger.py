@@ -11,12 +11,11 @@ import numpy as np
 
 from factorbus.solver.closures.choosing import IMPROBABLE, RIVAL, ClosureOdds
 from factorbus.solver.closures.motions import motions_of_poses
-from factorbus.solver.errors import SolverError
+from factorbus.solver.closures.naming import NotAClosure
 from factorbus.solver.graph.arenas import with_room
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import FactorGroup, FactorsLike
 from factorbus.solver.kernels.jit.compile import F64, I64
-from factorbus.wording import counted
 
 ACCEPTED, SUSPECT, REJECTED, RESTORED = "accepted", "suspect", "rejected", "restored"
 CLOSURE_STATES: tuple[str, ...] = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
@@ -35,6 +34,7 @@ class Closure:
     factor_id: its id, whether it is in or not; row: in its ledger.  came, changed: revisions, when it came, and when
     its state last changed.  reason: why its state is what it is.  distance: d², chance: the odds of its residual, both
     when it was last looked at.  tried: the newest rival when it was last taken out on trial.
+    is_weighed: it has a loss, by which it counts as a suspect too, and `chance` is its weight (`graduation`).
     """
 
     factor_id: int
@@ -47,40 +47,22 @@ class Closure:
     chance: float = float("nan")
     changed: int = 0
     tried: int = -1
+    is_weighed: bool = False
 
     @property
     def is_in(self) -> bool:
-        """Whether the estimate has it."""
-        return self.state in BELIEVED
+        """Whether it is a factor of the map."""
+        return self.would_be_in(self.state)
+
+    def would_be_in(self, state: str) -> bool:
+        """Whether it is one in this state."""
+        return state in BELIEVED or (self.is_weighed and state == SUSPECT)
 
     @property
     def keys(self) -> tuple[int, int]:
         """The poses it is between."""
         first, second = self.factor.keys[0].tolist()
         return first, second
-
-
-class NotAClosure(SolverError):
-    """A factor that is no closure which the map tests."""
-
-    code = "not_a_closure"
-
-    def __init__(self, factor: int, count: int) -> None:
-        have = f"it tests {counted(count, 'closure')}, which ask/suspects lists" if count else "it tests none so far"
-        super().__init__(f"factor {factor} is no loop closure that the map tests: {have}", factor=factor)
-
-
-class SwitchedOff(SolverError):
-    """A change of a closure that is not in the estimate."""
-
-    code = "switched_off"
-
-    def __init__(self, change: str, factor: int, state: str) -> None:
-        super().__init__(
-            f"{change}: factor {factor} is a loop closure that the estimate does not have ({state}); accept it first, "
-            "or remove it",
-            factor=factor, state=state,
-        )  # fmt: skip
 
 
 class ClosureVerdicts(NamedTuple):
@@ -168,7 +150,7 @@ class Ledger:
     def mark(self, closure: Closure) -> None:
         """Its state has changed."""
         row, is_suspect = closure.row, closure.state == SUSPECT
-        if self.is_suspect[row] and not is_suspect:  # Ω S Ω, of S when it was a suspect
+        if self.is_suspect[row] and not is_suspect and not closure.is_weighed:  # Ω S Ω, of S when it was a suspect
             weight = np.linalg.inv(self.noise[row])
             self.bound[row] = weight @ np.linalg.inv(self.bound[row]) @ weight
         elif self.is_suspect[row] != is_suspect:
@@ -212,10 +194,12 @@ class Ledger:
 class ClosureLedger:
     """All closures of a map, in the order in which they came.
 
-    looks: how often some were looked at.  moved_at: the look at which some went in or out last.
+    looks: how often some were looked at.  moved_at: the look at which some went in or out last.  weighs: closures are
+    weighed by losses.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, weighs: bool = False) -> None:
+        self._weighs = weighs
         self.of_kind = {kind: Ledger(kind) for kind in POSES_BETWEEN}
         self._of_factor: dict[int, Closure] = {}
         self._unlisted: list[Sequence[Closure]] = []
@@ -241,7 +225,7 @@ class ClosureLedger:
 
     def add(self, factor: FactorsLike, factor_id: int, graph: FactorGraph, revision: int) -> Closure:
         """A new one: a suspect that nobody has looked at."""
-        closure = Closure(factor_id, 0, factor, revision, changed=revision)
+        closure = Closure(factor_id, 0, factor, revision, changed=revision, is_weighed=self._weighs)
         self.of_kind[factor.kind].add(closure, [graph.find(key) for key in closure.keys], self.looks)
         self.of_factor[factor_id] = closure
         self._counts[SUSPECT] += 1
@@ -322,6 +306,12 @@ class ClosureLedger:
             ledger.bound[:] = np.nan
         return changed
 
+    def measure(self, closure: Closure, factor: FactorsLike) -> None:
+        """What it measures, and how well: a loss by which the map weighs it is none of its own."""
+        if closure.is_weighed and closure.state in (ACCEPTED, SUSPECT):
+            factor = FactorGroup(factor.kind, factor.keys, factor.measured, factor.information)
+        self.of_kind[factor.kind].measure(closure, factor)
+
     def forget(self, gone: Iterable[int], graph: FactorGraph) -> None:
         """Those with these ids are no more, and variables of the map may have other numbers."""
         for factor in gone:
@@ -351,7 +341,7 @@ class ClosureLedger:
 
     def load(self, state: Mapping[str, Any], graph: FactorGraph) -> None:
         """Be what one was that gave `state`, of this graph.  Raises KeyError, ValueError."""
-        self.__init__()
+        self.__init__(self._weighs)
         self.looks, self.moved_at = int(state["looks"]), int(state["moved_at"])
         here = {"measured": 0, "information": 0}
         for k, kind in enumerate(state["kind"]):
@@ -364,7 +354,7 @@ class ClosureLedger:
             factor = FactorGroup(kind, np.array(state["keys"][k : k + 1]), numbers[0], numbers[1], loss, scale)
             ids = [int(state[name][k]) for name in ("factor_id", "came", "changed", "tried")]
             told = state["state"][k], state["reason"][k], float(state["distance"][k]), float(state["chance"][k])
-            closure = Closure(ids[0], 0, factor, ids[1], *told, ids[2], ids[3])
+            closure = Closure(ids[0], 0, factor, ids[1], *told, ids[2], ids[3], self._weighs)
             self.of_kind[kind].add(closure, [graph.find(key) for key in closure.keys], int(state["looked"][k]))
             self.of_factor[closure.factor_id] = closure
             self._counts[closure.state] += 1

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.solver.changing import try_change, with_changes
-from factorbus.solver.closures.ledger import BELIEVED, Closure, ClosureLedger, ClosureVerdicts
+from factorbus.solver.closures.ledger import Closure, ClosureLedger, ClosureVerdicts
 from factorbus.solver.divergence import copied
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import FactorsLike
@@ -57,10 +57,10 @@ def planned_switch(ledger: ClosureLedger, verdicts: ClosureVerdicts) -> ClosureS
     """What `verdicts` ask of a map.  Raises NotAClosure."""
     out, into = [], []
     for c, state in zip(ledger.named(verdicts.factors.tolist()), verdicts.states, strict=True):
-        believed = state in BELIEVED
-        if c.is_in and not believed:
+        would_be_in = c.would_be_in(state)
+        if c.is_in and not would_be_in:
             out.append(c)
-        elif believed and not c.is_in:
+        elif would_be_in and not c.is_in:
             into.append(c)
     return ClosureSwitch(tuple(out), tuple(into))
 
