@@ -64,14 +64,14 @@ class GraduatedSolver:
 
     def _weighed(self, report: StepReport, new: Sequence[Closure]) -> GatedReport:
         """Stage after stage."""
-        moved, done = dict[int, tuple[Closure, str]](), True
+        moved = dict[int, tuple[Closure, str]]()
         stages = self.graduation.looks(lambda: self.solver, self.ledger, new)
         stage = next(stages, None)
         while stage is not None:
+            done = True
             if stage.scale is not None:
                 try:
                     self.solver, report = step_with(self.solver, stage)
-                    done = True
                 except SolverError:
                     done = False
             if done:

@@ -171,11 +171,12 @@ class _Look:
         """One stage after the other; where one fails all have the final scale again, and are suspects meanwhile."""
         scale_of, final = dict[int, float](), float(np.sqrt(self._c2))
         for rows, scale in scales:
+            before = dict(scale_of)
             stage = self._stage(rows, scale, scale_of)
             self._why.update(dict.fromkeys(rows.tolist(), GRADUATED))
             if stage is not None and not (yield stage):
-                left = np.array([row for row, k in scale_of.items() if k != final], np.int64)
-                if (back := self._stage(left, np.full(left.size, final), scale_of)) is not None:
+                left = np.array(list(before), np.int64)
+                if (back := self._stage(left, np.full(left.size, final), before)) is not None:
                     yield back
                 self._why.update(dict.fromkeys(rows.tolist(), FAILED))
                 return False
