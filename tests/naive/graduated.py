@@ -29,9 +29,10 @@ def graduated(
     edges: list[tuple[int, int, np.ndarray, np.ndarray, bool]],
     c2: float,
     schedule: tuple[float, ...],
+    least: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (n, 3), and the weights of closures, at the end of the schedule.  edges: from, to, z, Ω, whether it is a
-    closure."""
+    closure.  least: closures with less weight have none at the end."""
     x = poses.copy()
     for mu in schedule:
         for _ in range(_ITERATIONS):
@@ -39,6 +40,7 @@ def graduated(
             for i, j, z, omega, closes in edges:
                 r = residual(x[i], x[j], z)
                 w = weight(float(r @ omega @ r), mu, c2) if closes else 1.0
+                w = 0.0 if mu == schedule[-1] and w < least else w
                 J = np.zeros((3, x.size))
                 for end, k in np.ndindex(2, 3):
                     step = np.zeros((2, 3))

@@ -15,6 +15,7 @@ from factorbus.proto.own_clients import JUDGE
 from factorbus.service.core.events import Stepped, Verdict
 from factorbus.solver.closures import graduation
 from factorbus.solver.closures.graduation import ClosureGraduation
+from factorbus.solver.closures.ledger import OUTWEIGHED
 from factorbus.solver.errors import NotFinite
 
 LENGTH = 8
@@ -48,19 +49,24 @@ def losses(made: TestedMap) -> dict[int, str]:
     return {i: g.loss for g in made.solver.solver.graph()[1] for i in g.ids.tolist() if g.loss}
 
 
+def outweighed(made: TestedMap) -> set[int]:
+    found = made.suspects()
+    return {k for k, reason in zip(found.factors.tolist(), found.reasons, strict=True) if reason == "outweighed"}
+
+
 def test_words_of_reasons_are_those_of_the_wire() -> None:
-    own = {graduation.FITS, graduation.GRADUATING, graduation.GRADUATED, graduation.OUTWEIGHED}
+    own = {graduation.FITS, graduation.GRADUATING, graduation.GRADUATED, graduation.LIGHT, OUTWEIGHED}
     assert own < set(CLOSURE_REASONS)
 
 
-def test_all_closures_are_in_with_a_loss_and_what_does_not_fit_is_a_suspect_with_its_weight() -> None:
+def test_closures_have_a_loss_and_what_does_not_fit_is_a_suspect_with_its_weight_and_out() -> None:
     made = driven()
     factors = (right(1, LENGTH), between(2, 15, _FALSE), between(16, 17, [1.0, 0.0, 0.0]), right(3, LENGTH))
     (accepted,) = made.insert(Batch((Variables("se2", ids(17)),), factors))
     assert (accepted.first_factor, accepted.report["closures"], accepted.report["suspects"]) == (16, 3, 1)
     assert made.states() == {16: "accepted", 17: "suspect", 19: "accepted"}
-    assert made.in_graph() == made.ids
-    assert losses(made) == dict.fromkeys((16, 17, 19), "geman-mcclure")
+    assert made.in_graph() == {k: row for k, row in made.ids.items() if k != 17}
+    assert losses(made) == dict.fromkeys((16, 19), "geman-mcclure")
     found = made.suspects()
     assert found.policy == "robust"
     assert found.weight is not None
@@ -162,7 +168,7 @@ def test_losses_and_weights_that_a_user_gives() -> None:
     made = driven()
     made.insert(Batch((), (right(1, LENGTH), right(2, LENGTH), between(3, 14, _FALSE))))
     made.change(Change("loss", ids(16), loss="dcs", scale=np.ones(1)), Change("weigh", ids(17), weight=np.full(1, 0.5)))
-    assert losses(made) == {16: "dcs", 17: "geman-mcclure", 18: "geman-mcclure"}
+    assert losses(made) == {16: "dcs", 17: "geman-mcclure"}
     assert made.states() == {16: "restored", 17: "accepted", 18: "suspect"}, "its user weighs the first from now on"
     made.change(Change("reject", ids(17)))
     made.change(Change("accept", ids(17)))
@@ -171,8 +177,8 @@ def test_losses_and_weights_that_a_user_gives() -> None:
     np.testing.assert_allclose(found.information[found.ids == 17][0, 0], 0.5 / 0.02**2)
     refused = made.change(Change("reject", ids(18)), Change("accept", ids(18)))
     assert refused.code == "named_twice"
-    made.change(Change("reject", ids(18)))
     assert made.change(Change("weigh", ids(18), weight=np.ones(1))).code == "switched_off"
+    made.change(Change("reject", ids(18)))
     made.kill()
 
 
@@ -283,7 +289,7 @@ def test_whatever_happens_ids_stay_and_the_journal_gives_the_same_bits(
         elif what == "kill":
             made.kill(state, since) if n % 2 else made.kill()
         states = made.states()
-        out = {factor for factor, state_ in states.items() if state_ == "rejected"}
+        out = {factor for factor, state_ in states.items() if state_ == "rejected"} | outweighed(made)
         assert not states.keys() & gone
         made.check_counts()
         assert made.in_graph() == {factor: keys for factor, keys in made.ids.items() if factor not in gone | out}

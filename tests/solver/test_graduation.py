@@ -21,8 +21,8 @@ from factorbus.solver.closures.graduated_kernel import (
     sig_weights,
     with_final_loss,
 )
-from factorbus.solver.closures.graduation import GRADUATED, OUTWEIGHED, own_chi2
-from factorbus.solver.closures.ledger import ACCEPTED, FAILED, SUSPECT, ClosureLedger
+from factorbus.solver.closures.graduation import GRADUATED, own_chi2
+from factorbus.solver.closures.ledger import ACCEPTED, FAILED, OUTWEIGHED, SUSPECT, ClosureLedger
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.errors import NotFinite
 from factorbus.solver.report import StepReport
@@ -98,7 +98,7 @@ def test_it_comes_to_the_fixed_point_of_a_dense_twin(seed: int) -> None:
     edges = [(k, k + 1, z, OMEGA, False) for k, z in enumerate(odometry)]
     edges += [(i, j, z, OMEGA, True) for i, j, z, _ in closures]
     c2 = solver.graduation.c2["between_se2"]
-    poses, weights = graduated(start, edges, c2, CONTROL_PARAMETERS)
+    poses, weights = graduated(start, edges, c2, CONTROL_PARAMETERS, 0.01)
     found = poses_of(solver.solver)
     np.testing.assert_allclose(found[:, :2], poses[:, :2], atol=2e-5)
     np.testing.assert_allclose(np.cos(found[:, 2] - poses[:, 2]), 1.0, atol=1e-9)
@@ -177,12 +177,13 @@ def test_where_a_stage_fails_losses_are_final_and_it_is_graduated_later(monkeypa
     assert GRADUATED in {c.reason for c in solver.closures}
 
 
-def test_a_ledger_of_weighed_closures_has_suspects_in_the_map() -> None:
+def test_a_ledger_of_weighed_closures_has_suspects_in_the_map_but_for_outweighed_ones() -> None:
     ledger = ClosureLedger(weighs=True)
     solver = Solver()
     solver.stage(Batch((Variables("se2", np.array([0, 1]), np.zeros((2, 3)), True),)))
     c = ledger.add(between(0, 1, np.zeros(3)), 0, solver.factor_graph, 1)
-    assert (c.state, c.is_in, c.would_be_in("rejected")) == (SUSPECT, True, False)
+    assert (c.state, c.is_in) == (SUSPECT, True)
+    assert (c.would_be_in("rejected", "user"), c.would_be_in(SUSPECT, OUTWEIGHED)) == (False, False)
     again = ClosureLedger(weighs=True)
     again.load(ledger.dump(), solver.factor_graph)
     assert again.closures[0].is_weighed

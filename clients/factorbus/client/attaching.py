@@ -133,12 +133,12 @@ def _attach(here: Map, letters: str, given: Batch, absolute: str, settle: bool, 
         return Attached(found)
     anchors = found.anchors()
     _check_held(part, alone, anchors)
-    if here.closures == "test":
+    if here.closures != "trust":
         _check_not_tested(here, anchors, timeout_s)
     # 4. One insert.
     changes, turned = changes_of_frame(part, alone, roles, found.frame)
     batch = Batch((), (*turned, *anchors.factors))
-    sent = as_trusted(batch) if here.closures == "test" else batch
+    sent = as_trusted(batch) if here.closures != "trust" else batch
     accepted = here.insert(sent, changes=changes, settle=settle, timeout_s=timeout_s)
     # 5. What would take it back.
     ids = accepted.first_factor + np.arange(Batch((), tuple(turned)).factor_count, batch.factor_count)

@@ -63,7 +63,7 @@ def undo_attach(here: Map, attached: Attached, *, settle: bool = False, timeout_
     if keys := [key for group in part.held.variables for key in group.keys.tolist()]:
         changes.fix(keys)
     batch = Batch((), (*turned, *(group._replace(ids=None) for group in part.held.factors)))
-    sent = as_trusted(batch) if here.closures == "test" else batch
+    sent = as_trusted(batch) if here.closures != "trust" else batch
     return here.insert(sent, changes=changes, settle=settle, timeout_s=timeout_s)
 
 

@@ -157,7 +157,7 @@ class Map:
         here = self.ask_estimate(timeout_s=timeout_s)
         fitted = fit_into(here, other, anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute)
         with saying_how_to_rename():
-            batch = as_trusted(fitted.batch) if self.closures == "test" else fitted.batch
+            batch = as_trusted(fitted.batch) if self.closures != "trust" else fitted.batch
             return Merged(self.insert(batch, settle=settle, timeout_s=timeout_s), fitted)
 
     def send(

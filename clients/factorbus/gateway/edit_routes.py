@@ -85,6 +85,7 @@ class _EditRoutes:
                 "reason": found.reasons[k],
                 "distance": _told(float(found.distance[k])),
                 "chance": _told(float(found.chance[k])),
+                **({} if found.weight is None else {"weight": _told(float(found.weight[k]))}),
                 "since": int(found.changed[k]),
             }
             for k, factor in enumerate(found.factors.tolist())

@@ -22,7 +22,7 @@ CLOSURE_STATES = ("accepted", "suspect", "rejected", "restored")
 # Why a state is what it is.
 CLOSURE_REASONS = (
     "new", "passed", "agrees", "unsure", "improbable", "rival", "contradicted", "failed", "user",
-    "fits", "graduating", "graduated", "outweighed",
+    "fits", "graduating", "graduated", "light", "outweighed",
 )  # fmt: skip
 # What the event `closures` says of one that the map has no more, and why: a change named it, or a pose of it went.
 GONE, REMOVED, POSE_GONE = "gone", "removed", "pose_gone"

@@ -11,6 +11,8 @@ from factorbus.wording import counted
 if TYPE_CHECKING:
     from factorbus.client.map_row import MapRow
 
+_POLICIES = {"test": "tested", "robust": "weighed"}
+
 
 @click.command()
 @connect_option
@@ -47,6 +49,7 @@ def _shown(row: "MapRow") -> str:
     blocked = "; blocked: its journal cannot be written" if row.state == "blocked" else ""
     held = f"{counted(row.variables, 'variable')}, {counted(row.factors, 'factor')}"
     caveat = "" if row.reproducible is not False else "; not reproducible"
-    policies = ["closures tested"] * (row.closures == "test") + [f"steps of {row.budget_ms:g} ms"] * bool(row.budget_ms)
+    policies = [f"closures {_POLICIES[row.closures]}"] if row.closures in _POLICIES else []
+    policies += [f"steps of {row.budget_ms:g} ms"] * bool(row.budget_ms)
     policies += [f"keep {row.keep}"] * (row.keep != "all")
     return ", ".join([f"{held}, revision {row.revision:,}, mode {row.mode}", *policies]) + caveat + blocked

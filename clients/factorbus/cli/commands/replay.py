@@ -105,8 +105,8 @@ class RecordingCommand(NodeCommand):
 @mode_option
 @click.option(
     "--closures",
-    type=click.Choice(("trust", "test")),
-    help="Believe the file's loop closures, or test each as it comes.",
+    type=click.Choice(("trust", "test", "robust")),
+    help="Believe the file's loop closures, test each as it comes, or weigh them (graduated non-convexity).",
 )
 @click.option(
     "--every",
@@ -179,8 +179,9 @@ def command(as_json: bool, **asked: Any) -> None:
     check_kind(request.file)
     if request.in_process and request.connect:
         raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
-    if request.in_process and request.closures == "test":
-        raise click.UsageError("--in-process and --closures test exclude each other: a map on the bus tests closures")
+    if request.in_process and request.closures in ("test", "robust"):
+        name = request.closures
+        raise click.UsageError(f"--in-process and --closures {name} exclude each other: a map on the bus does that")
     if request.in_process and request.live:
         raise click.UsageError("--in-process and --live exclude each other: the page looks at a map on the bus")
     from factorbus.cli.output import console as screen

@@ -45,8 +45,8 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
 @click.option("--upstream-zenoh", metavar="FILE.json5", help="Zenoh configuration for it: TLS, user (deploy/zenoh).")
 @click.option(
     "--closures",
-    type=click.Choice(("trust", "test")),
-    help="Of new maps: believe loop closures, or test each when it comes.  [default: trust]",
+    type=click.Choice(("trust", "test", "robust")),
+    help="Of new maps: believe loop closures, test each when it comes, or weigh them (graduated non-convexity).  [default: trust]",
 )
 @click.option(
     "--budget-ms",

@@ -116,7 +116,7 @@ def _map(row: Mapping[str, Any]) -> str:
         f"{inserts['busy']} answered busy; {row['waiting']} waiting, {row['parked']} parked; "
         f"{counted(row['clients'], 'client')}",
         *([budget_line(row["budget"])] if "budget" in row else []),
-        *([_closures(row["closure_states"])] if "closure_states" in row else []),
+        *([_closures(row["closure_states"], row.get("closures", ""))] if "closure_states" in row else []),
         *([_kept(row)] if "kept" in row else []),
         *([components_line(row["components"])] if "components" in row else []),
         *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
@@ -125,10 +125,10 @@ def _map(row: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _closures(states: Mapping[str, int]) -> str:
+def _closures(states: Mapping[str, int], policy: str) -> str:
     """How many loop closures are in each state."""
     told = ", ".join(f"{count} {state}" for state, count in states.items())
-    return f"loop closures are tested: {told}"
+    return f"loop closures are {'weighed' if policy == 'robust' else 'tested'}: {told}"
 
 
 def _kept(row: Mapping[str, Any]) -> str:

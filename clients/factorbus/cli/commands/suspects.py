@@ -16,10 +16,11 @@ _SHOWN = 40  # more closures than these are listed with --json only
 @asks_map
 @click.option("--all", "every", is_flag=True, help="Those that the estimate has, too.")
 def suspects_command(address: MapAddress, every: bool, as_json: bool) -> int:
-    """Which loop closures the estimate does not have, why, and since which revision: of a map that tests them.
+    """Which loop closures the estimate does not have, or hardly, why, and since when: of a map that tests or weighs them.
 
     d² is how far off a closure is, squared, in standard deviations of what the map knows; chance, the odds that it
-    is false where every second one is. `factorbus change accept` and `reject` are the last word.
+    is false where every second one is; weight, of a map that weighs them (--closures robust), by how much of its
+    information it counts. `factorbus change accept` and `reject` are the last word.
 
     \b
     factorbus ask suspects warehouse
@@ -39,6 +40,7 @@ def suspects_command(address: MapAddress, every: bool, as_json: bool) -> int:
             "reason": found.reasons[k],
             "distance": _told(float(found.distance[k])),
             "chance": _told(float(found.chance[k])),
+            **({} if found.weight is None else {"weight": _told(float(found.weight[k]))}),
             "came": int(found.came[k]),
             "since": int(found.changed[k]),
         }
@@ -48,8 +50,8 @@ def suspects_command(address: MapAddress, every: bool, as_json: bool) -> int:
         content = {"revision": found.revision, "closures": found.policy, "counts": found.counts}
         document(content | {"listed": listed})
         return OK
-    if found.policy != "test":
-        rows = [("closures", "are trusted: this map tests none (`factorbus serve --closures test`)")]
+    if found.policy == "trust":
+        rows = [("closures", "are trusted: this map tests none (`factorbus serve --closures test`, or robust)")]
     else:
         rows = [(state, str(count)) for state, count in found.counts.items()]
         if not any(found.counts.values()):
@@ -63,7 +65,9 @@ def suspects_command(address: MapAddress, every: bool, as_json: bool) -> int:
 
 
 def _in_words(row: dict) -> str:
-    numbers = "" if row["distance"] is None else f", d² {row['distance']:.4g}, chance {row['chance']:.2g}"
+    distance = "" if row["distance"] is None else f", d² {row['distance']:.4g}"
+    odds = "weight" if "weight" in row else "chance"
+    numbers = distance + ("" if row[odds] is None else f", {odds} {row[odds]:.2g}")
     return f"{' '.join(row['between'])}: {row['state']}, {row['reason']}{numbers}, since revision {row['since']}"
 
 

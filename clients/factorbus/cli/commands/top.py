@@ -35,7 +35,7 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
       step ms    solver's time of a step, mean since the look before
       χ²         converging: left alone, the map goes on by itself to its optimum; gave up: it does not
       budget     where steps have one: what the last one took of it, and relinearizations left for later ones
-      suspects   where loop closures are tested: how many are not believed, of all
+      suspects   where loop closures are tested or weighed: how many are not believed, of all
       taken out  where a map keeps some poses (factorbus serve --keep): how many went since the service has it open
       waiting    inserts that are accepted by no step yet, and those parked behind a gap
       interest   a part of a map that clients follow, what its channel carries, and variables that wait for that

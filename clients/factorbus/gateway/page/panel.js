@@ -62,12 +62,14 @@ export function chooseFactor(factor) {
 }
 
 // What the map thinks of a closure that it does not believe is known already.
-function explainSuspect({ id, kind, keys, state, reason, distance, chance, since }) {
+function explainSuspect({ id, kind, keys, state, reason, distance, chance, weight, since }) {
   newest += 1;
   const said = {
     "poses": keys.join(", "), state, reason,
     "d²": distance === null ? "not looked at yet" : short(distance, 4),
-    "chance": chance === null ? "not looked at yet" : `odds of ${short(chance, 2)} that it is false`,
+    ...(weight === undefined
+      ? { "chance": chance === null ? "not looked at yet" : `odds of ${short(chance, 2)} that it is false` }
+      : { "weight": weight === null ? "not looked at yet" : short(weight, 2) }),
     "since": `revision ${since}`,
   };
   of("panel").replaceChildren(

@@ -63,7 +63,7 @@ def asked_changes(ledger: ClosureLedger, insert: Arrived, content: Insert) -> As
 def _weighed_of(ledger: ClosureLedger, ids: Sequence[int]) -> list[int]:
     """Those of them that are in, with a loss by which the map weighs them."""
     found = (ledger.of_factor.get(factor) for factor in ids)
-    return [c.factor_id for c in found if c is not None and c.is_weighed and c.state in (ACCEPTED, SUSPECT)]
+    return [c.factor_id for c in found if c and c.is_weighed and c.is_in and c.state in (ACCEPTED, SUSPECT)]
 
 
 def _together(said: Sequence[ClosureVerdicts]) -> ClosureVerdicts:

@@ -4,9 +4,11 @@
     2  closures that do not fit are graduated.  Each stage is an entry of its own behind the insert, of the client
        `JUDGE`, with the scales of losses, and a step; its report says that the map has not converged until the losses
        are final.  Applied again entries are what they were: nobody weighs
-    3  what has become of closures is an entry without scales; then the insert is answered
+    3  what has become of closures is an entry without scales, and a step where that takes any out; then the insert is
+       answered
 
-All closures are factors of the map, but for those that a user has rejected.  One that a user has accepted has no loss.
+One that is outweighed is in the ledger alone, as are suspects of a map that tests.  One that a user has accepted has no
+loss.
 """
 
 import logging
@@ -23,7 +25,7 @@ from factorbus.service.solving.asked import AskedChanges
 from factorbus.service.solving.closure_entries import verdicts_of_entry
 from factorbus.service.solving.tested import TestedMapSolver
 from factorbus.solver.closures.ahead import StagedBatch
-from factorbus.solver.closures.graduated_kernel import GRADUATED_LOSS, graduated_split, with_final_loss
+from factorbus.solver.closures.graduated_kernel import GRADUATED_LOSS, graduated_split, with_final_loss, with_scale
 from factorbus.solver.closures.graduation import GRADUATING, ClosureGraduation, GraduationStage
 from factorbus.solver.closures.ledger import NO_VERDICTS, REJECTED, RESTORED, Closure
 from factorbus.solver.closures.loops import SplitFactors
@@ -87,9 +89,14 @@ class RobustMapSolver(TestedMapSolver):
     def _apply_judged(self, insert: Arrived, content: Any) -> Generator[Verdict | Stepped, None, bool]:
         if content.scale is None:
             return (yield from super()._apply_judged(insert, content))
-        change = Change("loss", content.factors, loss=GRADUATED_LOSS, scale=content.scale)
-        made = insert._replace(content=Insert(insert.sequence, Batch(), changes=(change,)))
-        asked = AskedChanges(made, verdicts_of_entry(content), ClosureSwitch((), ()), set())
+        closures = self._ledger.named(content.factors.tolist())
+        inside = np.array([c.is_in for c in closures])
+        loss = Change("loss", content.factors[inside], loss=GRADUATED_LOSS, scale=content.scale[inside])
+        into = [(c, scale) for c, scale in zip(closures, content.scale.tolist(), strict=True) if not c.is_in]
+        batch: Any = Batch((), tuple(with_scale(c.factor, scale) for c, scale in into))
+        made = insert._replace(content=Insert(insert.sequence, batch, changes=(loss,) if inside.any() else ()))
+        switch = ClosureSwitch((), tuple(c for c, _ in into))
+        asked = AskedChanges(made, verdicts_of_entry(content), switch, set())
         self._stage_of, self._on_the_way = content.factors.size, GRADUATING in content.reasons
         try:
             with self._without_limits():

@@ -15,6 +15,7 @@ from factorbus.solver.closures.graduation import ClosureGraduation, step_with
 from factorbus.solver.closures.ledger import SUSPECT, Closure, ClosureLedger
 from factorbus.solver.closures.loops import TrustedForest
 from factorbus.solver.closures.policy import ClosurePolicy
+from factorbus.solver.closures.switching import planned_switch
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.groups import BatchLike
 from factorbus.solver.options import Options
@@ -23,7 +24,7 @@ from factorbus.solver.solver import Solver
 
 
 class GraduatedSolver:
-    """A `Solver`, in `solver`, with all closures, each by its weight.  Not thread-safe."""
+    """A `Solver`, in `solver`, with closures by their weight, without outweighed ones.  Not thread-safe."""
 
     def __init__(self, options: Options | None = None, policy: ClosurePolicy | None = None) -> None:
         self.solver, self.graduation = Solver(options), ClosureGraduation(policy)
@@ -69,9 +70,9 @@ class GraduatedSolver:
         stage = next(stages, None)
         while stage is not None:
             done = True
-            if stage.scale is not None:
+            if stage.scale is not None or planned_switch(self.ledger, stage.verdicts).out:
                 try:
-                    self.solver, report = step_with(self.solver, stage)
+                    self.solver, report = step_with(self.solver, self.ledger, stage)
                 except SolverError:
                     done = False
             if done:

@@ -51,6 +51,11 @@ def chi2_of_weights(weights: F64, c2: float) -> F64:
     return np.asarray(c2 * (1.0 / np.sqrt(weights) - 1.0), np.float64)
 
 
+def with_scale(factor: FactorsLike, scale: float) -> FactorGroup:
+    """A closure with the loss of this scale."""
+    return FactorGroup(factor.kind, factor.keys, factor.measured, factor.information, GRADUATED_LOSS, np.array([scale]))
+
+
 def graduated_split(split: SplitFactors) -> SplitFactors:
     """Without those that have a loss of their own: their sender weighs them."""
     kept = [k for k, factor in enumerate(split.closing) if not factor.loss]

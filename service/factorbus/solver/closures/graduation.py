@@ -3,12 +3,13 @@
     1  a new closure goes in with its final loss, in the step of its batch.  Most fit, and nothing follows
     2  one that does not fit is held against the map with the joint covariance of its ends.  d² is what χ² of all the
        rest rises by if the map gives way to it, to first order: within the gate that is less than what its loss counts
-       where the map does not, so it is graduated.  Beyond it is outweighed, and the map does not bend to it
+       where the map does not, so it is graduated.  Beyond, the map does not bend to it
     3  graduated: its kernel begins quadratic, and so do those of closures whose residuals that moves; a step each for
        μ = 0.12, 0.384, 0.9648 and 1 (`graduated_kernel`)
-    4  closures that are outweighed may be right and the map wrong.  Where three or more agree around their loops they
+    4  one with less than a hundredth of its weight is outweighed, and is no factor of the map until it is graduated
+    5  closures that are outweighed may be right and the map wrong.  Where three or more agree around their loops they
        are graduated together on a copy, and that is done in the map if its χ², with all losses final, is lower then
-    5  outweighed ones whose residual has changed are looked at again with the next closure
+    6  outweighed ones whose residual has changed are looked at again with the next closure
 
 Deciding is here; whoever has the solver makes the steps, and says whether they went well.
 """
@@ -18,6 +19,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from factorbus.solver.changes.requested import ChangeLike
 from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.closures.choosing import LEAST_RIVALS, limits_of
 from factorbus.solver.closures.evidence import FalseSpread, judge_each, judge_pairs
@@ -27,10 +29,12 @@ from factorbus.solver.closures.graduated_kernel import (
     chi2_of_weights,
     final_weights,
     scales_at,
+    with_scale,
 )
 from factorbus.solver.closures.ledger import (
     ACCEPTED,
     FAILED,
+    OUTWEIGHED,
     SUSPECT,
     Closure,
     ClosureLedger,
@@ -41,18 +45,20 @@ from factorbus.solver.closures.ledger import (
 from factorbus.solver.closures.motions import inverse_motion, tangent_of
 from factorbus.solver.closures.numbers import closure_numbers
 from factorbus.solver.closures.policy import ClosurePolicy
+from factorbus.solver.closures.switching import planned_switch
 from factorbus.solver.divergence import copied
 from factorbus.solver.errors import SolverError
+from factorbus.solver.graph.groups import Addition
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
 
-FITS, GRADUATING, GRADUATED, OUTWEIGHED = "fits", "graduating", "graduated", "outweighed"
+FITS, GRADUATING, GRADUATED, LIGHT = "fits", "graduating", "graduated", "light"
+_LEAST_WEIGHT = 0.01  # of a closure that is in the map
 _MOVED = 0.1  # of c² + s: by more s has changed
 _COMPARED = 32  # of the newest that are outweighed
 _SAME_SCALE = 1e-3  # of k: a loss that changes by less stays
 _LOOK_BACK_EVERY = 8  # looks
-_UNTRIED = 2  # of those that agree, that were in no trial
 
 
 class GraduationStage(NamedTuple):
@@ -99,7 +105,7 @@ class _Look:
     def __init__(
         self, solver: Callable[[], Solver], ledgers: ClosureLedger, kind: str, settings: ClosureGraduation
     ) -> None:
-        self._solver, self._ledger = solver, ledgers.of_kind[kind]
+        self._solver, self._ledgers, self._ledger = solver, ledgers, ledgers.of_kind[kind]
         self._c2, self._gate, self._spread = settings.c2[kind], settings.gate[kind], settings._spreads[kind]
         self._looks_back = ledgers.looks % _LOOK_BACK_EVERY == 0
         self._distance: dict[int, float] = {}  # d² by row, as found here
@@ -116,7 +122,8 @@ class _Look:
         if looked_at.size:
             distance = judge_each(closure_numbers(self._solver(), ledger, looked_at), [self._spread]).distance
             self._distance.update(zip(looked_at.tolist(), distance.tolist(), strict=True))
-            plausible = looked_at[distance <= self._gate]
+            fits = own_chi2(self._solver(), ledger, looked_at) <= self._c2
+            plausible = looked_at[(distance <= self._gate) | fits]
             done = True
             if plausible.size:
                 done = yield from self._carry_out(self._graduate(self._solver, plausible))
@@ -148,7 +155,8 @@ class _Look:
             return rows
         before = chi2_of_weights(np.array([closures[row].chance for row in rows.tolist()]), self._c2)
         failed = np.array([closures[row].reason == FAILED for row in rows.tolist()])
-        return rows[self._has_moved(before, own_chi2(self._solver(), self._ledger, rows)) | failed]
+        chi2 = own_chi2(self._solver(), self._ledger, rows)
+        return rows[self._has_moved(before, chi2) | failed | (chi2 <= self._c2)]
 
     def _has_moved(self, before: F64, chi2: F64) -> np.ndarray:
         return np.asarray(~(np.abs(chi2 - before) <= _MOVED * (self._c2 + before)))
@@ -203,16 +211,18 @@ class _Look:
         ledger, solver = self._ledger, self._solver()
         group = self._agreeing(far)
         closures = [ledger.closures[row] for row in group.tolist()]
-        if group.size < LEAST_RIVALS or sum(c.tried < 0 for c in closures) < _UNTRIED:
+        untried = sum(c.tried < 0 for c in closures)
+        if group.size < LEAST_RIVALS or 2 * untried < group.size:
             return True
         self._tried.update(dict.fromkeys(group.tolist(), max(c.factor_id for c in closures)))
         stages, scale_of = list[_Scales](), dict[int, float]()
-        held, chi2 = [copied(solver)], solver.chi2()
+        own = own_chi2(solver, ledger, group)[[not c.is_in for c in closures]]
+        held, chi2 = [copied(solver)], solver.chi2() + float((self._c2 * own / (self._c2 + own)).sum())
         try:
             for scales in self._graduate(lambda: held[0], group):
                 stages.append(scales)
                 if (stage := self._stage(*scales, scale_of)) is not None:
-                    held[0] = step_with(held[0], stage).solver
+                    held[0] = step_with(held[0], self._ledgers, stage).solver
         except SolverError:
             return True
         if not held[0].chi2() < chi2:
@@ -234,14 +244,19 @@ class _Look:
     def _verdicts(self, rows: I64, chi2: F64, looked_at: np.ndarray) -> ClosureVerdicts:
         """Of those that were looked at, graduated or tried, and of others whose state is another."""
         told = []
+        noted = np.array([*self._why, *self._tried], np.int64)
+        other = (chi2 <= self._c2) != self._ledger.is_tested[rows]
+        chosen = looked_at | other | np.isin(rows, noted)
+        rows, chi2, looked_at = rows[chosen], chi2[chosen], looked_at[chosen]
         weights = final_weights(chi2, self._c2)
         for row, s, weight, looked in zip(rows.tolist(), chi2.tolist(), weights.tolist(), looked_at, strict=True):
             c, why, tried = self._ledger.closures[row], self._why.get(row, ""), self._tried.get(row)
-            state = ACCEPTED if s <= self._c2 and why != FAILED else SUSPECT
+            state = ACCEPTED if s <= self._c2 and why != FAILED and c.is_in else SUSPECT
             if not (looked or why or tried is not None or state != c.state):
                 continue
-            reason = OUTWEIGHED if state == SUSPECT else why or (c.reason if c.reason == GRADUATED else FITS)
-            reason = FAILED if why == FAILED else reason
+            reason = why or (c.reason if c.reason == GRADUATED else FITS)
+            if state == SUSPECT and why != FAILED:
+                reason = OUTWEIGHED if weight < _LEAST_WEIGHT or not c.is_in else LIGHT
             distance = self._distance.get(row, c.distance)
             told.append((c, state, reason, distance, weight, c.tried if tried is None else tried))
         return verdicts_of(told)
@@ -278,10 +293,27 @@ def own_chi2(solver: Solver, ledger: Ledger, rows: I64) -> F64:
     return np.einsum("na,na->n", r, np.linalg.solve(now.noise, r[..., None])[..., 0])
 
 
-def step_with(solver: Solver, stage: GraduationStage) -> SteppedWith:
-    """Make the step of a stage.  Raises SolverError."""
-    changes = [LossChanged(stage.verdicts.factors, stage.scale)]
-    if (came := try_change(solver, changes)) is not None:
+def step_with(solver: Solver, ledgers: ClosureLedger, stage: GraduationStage) -> SteppedWith:
+    """Make the step of a stage with scales, or that takes out what is outweighed.  Raises SolverError."""
+    ids, following = stage.verdicts.factors, solver.factor_graph.next_id
+    if stage.scale is None:
+        return _changed(solver, planned_switch(ledgers, stage.verdicts).removals, Addition((), ()))
+    inside = solver.factor_graph.rows_of(ids) >= 0
+    changes = [LossChanged(ids[inside], stage.scale[inside])] if inside.any() else []
+    closures = zip(ledgers.named(ids[~inside].tolist()), stage.scale[~inside].tolist(), strict=True)
+    batch = Addition((), [with_scale(c.factor, scale) for c, scale in closures])
+    if changes:
+        done = _changed(solver, changes, batch)
+    else:
+        solver.stage(batch)
+        done = SteppedWith(solver, solver.step())
+    if not inside.all():
+        done.solver.factor_graph.rename_last(ids[~inside], following)
+    return done
+
+
+def _changed(solver: Solver, changes: Sequence[ChangeLike], batch: Addition) -> SteppedWith:
+    if (came := try_change(solver, changes, batch)) is not None:
         return SteppedWith(solver, came[1])
-    other, _, report, _ = with_changes(solver, changes)
+    other, _, report, _ = with_changes(solver, changes, batch)
     return SteppedWith(other, report)

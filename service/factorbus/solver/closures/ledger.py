@@ -19,7 +19,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 
 ACCEPTED, SUSPECT, REJECTED, RESTORED = "accepted", "suspect", "rejected", "restored"
 CLOSURE_STATES: tuple[str, ...] = (ACCEPTED, SUSPECT, REJECTED, RESTORED)
-NEW, BY_USER, FAILED = "new", "user", "failed"
+NEW, BY_USER, FAILED, OUTWEIGHED = "new", "user", "failed", "outweighed"
 POSES_BETWEEN = {"between_se2": 3, "between_se3": 7}  # numbers of a pose
 BELIEVED = {ACCEPTED, RESTORED}
 _ROOM = 256  # closures, from the first: to make more means new pages for ten columns
@@ -34,7 +34,7 @@ class Closure:
     factor_id: its id, whether it is in or not; row: in its ledger.  came, changed: revisions, when it came, and when
     its state last changed.  reason: why its state is what it is.  distance: d², chance: the odds of its residual, both
     when it was last looked at.  tried: the newest rival when it was last taken out on trial.
-    is_weighed: it has a loss, by which it counts as a suspect too, and `chance` is its weight (`graduation`).
+    is_weighed: it has a loss, as a suspect that is not outweighed too, and `chance` is its weight (`graduation`).
     """
 
     factor_id: int
@@ -52,11 +52,11 @@ class Closure:
     @property
     def is_in(self) -> bool:
         """Whether it is a factor of the map."""
-        return self.would_be_in(self.state)
+        return self.would_be_in(self.state, self.reason)
 
-    def would_be_in(self, state: str) -> bool:
-        """Whether it is one in this state."""
-        return state in BELIEVED or (self.is_weighed and state == SUSPECT)
+    def would_be_in(self, state: str, reason: str) -> bool:
+        """Whether it is one in this state for this reason."""
+        return state in BELIEVED or (self.is_weighed and state == SUSPECT and reason != OUTWEIGHED)
 
     @property
     def keys(self) -> tuple[int, int]:

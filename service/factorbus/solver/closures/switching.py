@@ -56,8 +56,9 @@ class FactorsRemoved:
 def planned_switch(ledger: ClosureLedger, verdicts: ClosureVerdicts) -> ClosureSwitch:
     """What `verdicts` ask of a map.  Raises NotAClosure."""
     out, into = [], []
-    for c, state in zip(ledger.named(verdicts.factors.tolist()), verdicts.states, strict=True):
-        would_be_in = c.would_be_in(state)
+    named = ledger.named(verdicts.factors.tolist())
+    for c, state, reason in zip(named, verdicts.states, verdicts.reasons, strict=True):
+        would_be_in = c.would_be_in(state, reason)
         if c.is_in and not would_be_in:
             out.append(c)
         elif would_be_in and not c.is_in:
