@@ -43,6 +43,17 @@ def messages() -> dict[str, bytes]:
         np.array([[x[0], x[3]]]), ("between_se2",), ("suspect",), ("improbable",), np.array([81.25]),
         np.array([0.0078125]), np.array([3]), np.array([3]),
     )  # fmt: skip
+    graduated = encode_closure_entry(
+        ClosureEntry(
+            3, np.array([4]), ("suspect",), ("graduating",), np.array([2.5]), np.array([0.0625]), np.array([-1]),
+            scale=np.array([5.5]),
+        )
+    )  # fmt: skip
+    weighed = Suspects(
+        _EPOCH, 4, "robust", {"accepted": 0, "suspect": 1, "rejected": 0, "restored": 0}, np.array([_FALSE]),
+        np.array([[x[0], x[3]]]), ("between_se2",), ("suspect",), ("outweighed",), np.array([81.25]),
+        np.array([0.9375]), np.array([3]), np.array([3]), np.array([0.0625]),
+    )  # fmt: skip
     said = (Change("accept", np.array([4, 17])), Change("reject", np.array([_FALSE])))
     return {
         "admin_create_closures": codec.encode_map({"map": "kitchen", "mode": "auto", "closures": "test"}),
@@ -51,7 +62,9 @@ def messages() -> dict[str, bytes]:
         "suspects": encode_suspects(found),
         "suspects_none": encode_suspects(Suspects(_EPOCH, 4, "trust")),
         "closure_entry": judged,
+        "suspects_weighed": encode_suspects(weighed),
         "closure_entry_ahead": believed,
+        "closure_entry_scales": graduated,
         "insert_overrides": codec.encode_insert(Insert(7, Batch(), epoch=_EPOCH, changes=said)),
         "insert_trusted": codec.encode_insert(Insert(8, Batch(factors=(edge,)), epoch=_EPOCH)),
         "event_closures": codec.encode_map(

@@ -3,8 +3,6 @@
 import json
 import queue
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,9 @@ from false_closures import DriveWithFalse, drive_with_false
 from journalled import Services, Stream
 from processes import PATIENCE_S
 from replicas import Link, replica_settings, upstream_row, wait_until_level
+from tested_service import ran, told, values
 
-from factorbus.client import Changes, Draft, Map, Refused, connect
+from factorbus.client import Changes, Draft, Refused, connect
 from factorbus.journal.store import open_store
 from factorbus.proto import keys
 from factorbus.proto.own_clients import JUDGE
@@ -30,14 +29,6 @@ POSES = 260
 def drive() -> DriveWithFalse:
     """Of these seeds both right and false closures come."""
     return drive_with_false(POSES, 2, 0.4, "random")
-
-
-def ran(*arguments: str, code: int = 0) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "factorbus.cli", *arguments], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == code, done.stderr
-    return done.stdout
 
 
 def events_of(endpoint: str, name: str) -> tuple[zenoh.Session, "queue.SimpleQueue[dict[str, Any]]"]:
@@ -52,15 +43,6 @@ def events_of(endpoint: str, name: str) -> tuple[zenoh.Session, "queue.SimpleQue
 
     session.declare_subscriber(keys.event_key(name), zenoh.handlers.Callback(take, indirect=False))
     return session, came
-
-
-def told(joined: Map) -> dict[int, tuple[str, str]]:
-    found = joined.suspects(every=True)
-    return {k: (s, r) for k, s, r in zip(found.factors.tolist(), found.states, found.reasons, strict=True)}
-
-
-def values(joined: Map) -> list[bytes]:
-    return [group.values.tobytes() for group in joined.ask_estimate().variables if group.values is not None]
 
 
 def test_a_drive_with_false_closures(services: Callable[..., Services], tmp_path: Path, drive: DriveWithFalse) -> None:

@@ -56,9 +56,10 @@ from factorbus.solver.solver import Solver
 FITS, GRADUATING, GRADUATED, LIGHT = "fits", "graduating", "graduated", "light"
 _LEAST_WEIGHT = 0.01  # of a closure that is in the map
 _MOVED = 0.1  # of c² + s: by more s has changed
-_COMPARED = 32  # of the newest that are outweighed
+_COMPARED = 32  # suspects that are looked at again, or may agree with new ones
 _SAME_SCALE = 1e-3  # of k: a loss that changes by less stays
 _LOOK_BACK_EVERY = 8  # looks
+_UNTRIED = 2  # of those that agree, that were in no trial
 
 
 class GraduationStage(NamedTuple):
@@ -144,19 +145,20 @@ class _Look:
         return np.flatnonzero(self._ledger.is_tested[:n] | self._ledger.is_suspect[:n])
 
     def _suspects(self) -> I64:
-        """Rows of the newest ones that were outweighed before."""
+        """Rows of those of before."""
         n = self._ledger.count
-        return np.flatnonzero(self._ledger.is_suspect[:n] & ~self._ledger.is_new[:n])[-_COMPARED:]
+        return np.flatnonzero(self._ledger.is_suspect[:n] & ~self._ledger.is_new[:n])
 
     def _changed(self) -> I64:
-        """Those of them whose residual has changed, or whose step failed."""
+        """Those of them whose residual has changed, or whose step failed: of many those that fit best."""
         rows, closures = self._suspects(), self._ledger.closures
         if not rows.size:
             return rows
         before = chi2_of_weights(np.array([closures[row].chance for row in rows.tolist()]), self._c2)
         failed = np.array([closures[row].reason == FAILED for row in rows.tolist()])
         chi2 = own_chi2(self._solver(), self._ledger, rows)
-        return rows[self._has_moved(before, chi2) | failed | (chi2 <= self._c2)]
+        due = np.flatnonzero(self._has_moved(before, chi2) | failed | (chi2 <= self._c2))
+        return rows[np.sort(due[np.argsort(chi2[due], kind="stable")[:_COMPARED]])]
 
     def _has_moved(self, before: F64, chi2: F64) -> np.ndarray:
         return np.asarray(~(np.abs(chi2 - before) <= _MOVED * (self._c2 + before)))
@@ -212,7 +214,7 @@ class _Look:
         group = self._agreeing(far)
         closures = [ledger.closures[row] for row in group.tolist()]
         untried = sum(c.tried < 0 for c in closures)
-        if group.size < LEAST_RIVALS or 2 * untried < group.size:
+        if group.size < LEAST_RIVALS or untried < _UNTRIED:
             return True
         self._tried.update(dict.fromkeys(group.tolist(), max(c.factor_id for c in closures)))
         stages, scale_of = list[_Scales](), dict[int, float]()
@@ -233,7 +235,7 @@ class _Look:
         """The newest of `far` that is still outweighed, and all that agree with it; none where it is not."""
         ledger = self._ledger
         out = far[own_chi2(self._solver(), ledger, far) > self._c2]
-        others = np.concatenate([self._suspects(), out[:-1]])
+        others = np.concatenate([self._suspects()[-_COMPARED:], out[:-1]])
         if not out.size or not others.size:
             return out[:0]
         rows = np.append(others, out[-1:])
