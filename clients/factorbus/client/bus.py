@@ -87,8 +87,8 @@ class Bus:
         window: inserts that may be unanswered at a time.  mirror: keep a live copy of the estimate; returns once
         it is there.  client: who inserts into this map, where one connection is used for several; empty: that of
         `connect`.  interest: mirror these variables alone, at its rate; `insert` does not wait until they are there.
-        closures: "trust", "test" or "robust", what becomes of its loop closures (None: as the service has it for new maps).
-        Its steps have the budget that the service has for new maps; `create` it first for another.
+        closures: "trust", "test" or "robust", what becomes of its loop closures (None: as the service has it for new
+        maps).  Its steps have the budget that the service has for new maps; `create` it first for another.
         Raises Refused, Unavailable, BadName, BadOption, UnknownKind, UnknownMap, NotSupported.
         """
         keys.checked_name("map", name)
@@ -176,10 +176,10 @@ class Bus:
     ) -> MapRow:
         """Create map `name`, or find it as it is if its mode is the same, and so are the others where they are given.
 
-        closures: "trust", "test" or "robust", what becomes of its loop closures.  budget_ms: what a step of it may take, in
-        milliseconds; what does not fit follows in later steps; 0: there is no bound.  keep: which poses stay of places
-        that are driven through again and again, "all" or such as {"per_area": 2.0, "window": 50}.  None of any: that
-        of a map which is there, or what the service has for new ones.
+        closures: "trust", "test" or "robust", what becomes of its loop closures.  budget_ms: what a step of it may
+        take, in milliseconds; what does not fit follows in later steps; 0: there is no bound.  keep: which poses stay
+        of places that are driven through again and again, "all" or such as {"per_area": 2.0, "window": 50}.  None of
+        any: that of a map which is there, or what the service has for new ones.
         Raises Refused, Unavailable, BadName, BadOption, NotSupported.
         """
         asked = {"map": keys.checked_name("map", name), "mode": mode, "closures": closures, "budget_ms": budget_ms}

@@ -46,7 +46,7 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
 @click.option(
     "--closures",
     type=click.Choice(("trust", "test", "robust")),
-    help="Of new maps: believe loop closures, test each when it comes, or weigh them (graduated non-convexity).  [default: trust]",
+    help="Of new maps: believe loop closures, test them, or weigh them (graduated non-convexity).  [default: trust]",
 )
 @click.option(
     "--budget-ms",

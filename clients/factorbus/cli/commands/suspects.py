@@ -16,7 +16,7 @@ _SHOWN = 40  # more closures than these are listed with --json only
 @asks_map
 @click.option("--all", "every", is_flag=True, help="Those that the estimate has, too.")
 def suspects_command(address: MapAddress, every: bool, as_json: bool) -> int:
-    """Which loop closures the estimate does not have, or hardly, why, and since when: of a map that tests or weighs them.
+    """Which loop closures the estimate hardly has or not, why, and since when: of a map that tests or weighs them.
 
     d² is how far off a closure is, squared, in standard deviations of what the map knows; chance, the odds that it
     is false where every second one is; weight, of a map that weighs them (--closures robust), by how much of its

@@ -93,8 +93,10 @@ class RobustMapSolver(TestedMapSolver):
         inside = np.array([c.is_in for c in closures])
         loss = Change("loss", content.factors[inside], loss=GRADUATED_LOSS, scale=content.scale[inside])
         into = [(c, scale) for c, scale in zip(closures, content.scale.tolist(), strict=True) if not c.is_in]
-        batch: Any = Batch((), tuple(with_scale(c.factor, scale) for c, scale in into))
-        made = insert._replace(content=Insert(insert.sequence, batch, changes=(loss,) if inside.any() else ()))
+        added: Any = tuple(with_scale(c.factor, scale) for c, scale in into)
+        made = insert._replace(
+            content=Insert(insert.sequence, Batch((), added), changes=(loss,) if inside.any() else ())
+        )
         switch = ClosureSwitch((), tuple(c for c, _ in into))
         asked = AskedChanges(made, verdicts_of_entry(content), switch, set())
         self._stage_of, self._on_the_way = content.factors.size, GRADUATING in content.reasons
