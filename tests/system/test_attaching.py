@@ -24,7 +24,7 @@ def how_far_off(hall: Map, one: Drive, other: Drive) -> float:
 
 
 @pytest.mark.parametrize("kind", ["se2", "se3"])
-@pytest.mark.parametrize("closures", ["trust", "test"])
+@pytest.mark.parametrize("closures", ["trust", "test", "robust"])
 def test_a_robot_is_attached_when_enough_agree_and_not_before(endpoint: str, kind: str, closures: str) -> None:
     one, other, candidates = drives(kind, 5, 10, 14)
     name = f"hall-{kind}-{closures}"

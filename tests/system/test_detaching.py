@@ -37,7 +37,7 @@ def check_apart(hall: Map, before: dict[int, np.ndarray], atol: float = 1e-6) ->
 
 
 @pytest.mark.parametrize("kind", ["se2", "se3"])
-@pytest.mark.parametrize("closures", ["trust", "test"])
+@pytest.mark.parametrize("closures", ["trust", "test", "robust"])
 def test_it_is_as_it_was_and_what_came_since_goes_along(endpoint: str, kind: str, closures: str) -> None:
     one, other, candidates = drives(kind, 5, AGREE, 8)
     with connect(endpoint, client="matcher", timeout_s=60) as bus:

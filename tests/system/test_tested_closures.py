@@ -170,12 +170,13 @@ def test_killed_again_and_again_nothing_is_lost_or_done_twice(
     assert "all the same to the bit" in verified
 
 
+@pytest.mark.parametrize("policy", ["test", "robust"])
 def test_a_replica_has_the_verdicts_of_upstream_and_upstream_those_of_the_replica(
-    services: Callable[..., Services], tmp_path: Path, drive: DriveWithFalse
+    services: Callable[..., Services], tmp_path: Path, drive: DriveWithFalse, policy: str
 ) -> None:
-    base = services(tmp_path / "base", 'name="base"', 'closures="test"')
+    base = services(tmp_path / "base", 'name="base"', f'closures="{policy}"')
     link = Link(base.start())
-    robot = services(tmp_path / "robot", *replica_settings(link), 'closures="test"')
+    robot = services(tmp_path / "robot", *replica_settings(link), f'closures="{policy}"')
     name, half = json.loads(replica_settings(link)[2].partition("=")[2])[0], POSES // 2
     with (
         connect(robot.start(), client="robot", timeout_s=PATIENCE_S) as bus,
@@ -186,7 +187,7 @@ def test_a_replica_has_the_verdicts_of_upstream_and_upstream_those_of_the_replic
             driven.insert(batch)
         base.eventually(lambda: upstream_row(driven), lambda row: bool(row["connected"]) and row["behind"] == 0)
         at_base = other.map(name)
-        assert other.maps()[0].closures == "test"
+        assert other.maps()[0].closures == policy
         for batch in drive.batches[half:]:
             at_base.insert(batch)
         out = at_base.suspects().factors.tolist()
