@@ -38,10 +38,11 @@ def list_changed(first: int, graph_table: I64, tree_table: I64, out: I64) -> int
 @inline_kernel
 def differs_in_tree(v: int, var: I64, lin: I64, values: I64) -> bool:
     """Whether a value has other bits than in lin[2]."""
-    x, differs = var[v, at.V_AT], False
-    for a in range(size_of(var[v, at.V_KIND])):
-        differs |= lin[2, x + a] != values[x + a]
-    return differs
+    x = var[v, at.V_AT]
+    last = x + size_of(var[v, at.V_KIND])
+    while x < last and lin[2, x] == values[x]:
+        x += 1
+    return x < last
 
 
 @part

@@ -8,6 +8,7 @@ import math
 
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.model.se2 import wrap
+from factorbus.solver.kernels.model.se3 import half_turn
 
 # Below this angle the series of b and c are exact to the last digits, and the quotients are not.
 _SMALL = 1e-3
@@ -42,6 +43,5 @@ def exp_se3(p: F64, k: int, delta: float, y: F64, to: int) -> None:
     y[to] = u0 + b * g0 + c * (f1 * g2 - f2 * g1)
     y[to + 1] = u1 + b * g1 + c * (f2 * g0 - f0 * g2)
     y[to + 2] = u2 + b * g2 + c * (f0 * g1 - f1 * g0)
-    # sin(α/2)/α; its series where the quotient loses digits.
-    half = 0.5 - alpha * alpha / 48.0 if alpha < 1e-4 else math.sin(0.5 * alpha) / alpha
-    y[to + 3], y[to + 4], y[to + 5], y[to + 6] = half * f0, half * f1, half * f2, math.cos(0.5 * alpha)
+    half, cosine = half_turn(alpha * alpha)
+    y[to + 3], y[to + 4], y[to + 5], y[to + 6] = half * f0, half * f1, half * f2, cosine

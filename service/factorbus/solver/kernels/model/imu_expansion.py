@@ -29,9 +29,8 @@ from factorbus.solver.kernels.model.preintegration import (
     ROOM_T,
     ROOM_V,
     ROOM_V_B,
-    half_turn,
 )
-from factorbus.solver.kernels.model.se3 import quat_product
+from factorbus.solver.kernels.model.se3 import half_turn, quat_product
 
 MOST_MISSED = 1e-5
 SLOPES = 45  # numbers of J

@@ -31,7 +31,7 @@ from factorbus.solver.kernels.model.imu_walk import (
     V,
     Walk,
 )
-from factorbus.solver.kernels.model.preintegration import SMALL_TURN
+from factorbus.solver.kernels.model.se3 import SMALL_TURN
 
 SIZE = 9  # numbers of Δ
 # A pivot below this share of its diagonal entry is rounding: Σ is singular.

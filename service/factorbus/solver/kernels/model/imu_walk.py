@@ -21,7 +21,8 @@ from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model.imu_layout import ImuLayout
-from factorbus.solver.kernels.model.preintegration import SMALL_TURN, few_terms_of, series_of
+from factorbus.solver.kernels.model.preintegration import few_terms_of, series_of
+from factorbus.solver.kernels.model.se3 import SMALL_TURN
 
 LANES = 4  # the bias of the measurement, and one beside it for each gyroscope
 STEP = 1e-5  # radians that the lanes beside it are off, of the rotation in all

@@ -16,11 +16,7 @@ import numpy as np
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.model.imu_layout import ImuLayout
-from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix
-
-SMALL_TURN = (
-    0.04  # radians²: below, the terms of the series are exact to rounding, and take half the time of sine and cosine
-)
+from factorbus.solver.kernels.model.se3 import SMALL_TURN, half_turn, quat_product, rotation_matrix
 
 
 class Preintegrated(NamedTuple):
@@ -187,17 +183,6 @@ def add_sample(z: F64, k: int, b: F64, delta: Preintegrated, sample: SampleTerms
 def fill_rotation(q: F64, k: int, R: F64) -> None:
     """R (3, 3) := the rotation of the quaternion at q[k]."""
     R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2] = rotation_matrix(q, k)
-
-
-@inline_kernel
-def half_turn(square: float) -> tuple:
-    """(sin(θ/2)/θ, cos(θ/2)) of θ²: the quaternion of a rotation vector φ is (sin(θ/2)/θ φ, cos(θ/2))."""
-    if square >= SMALL_TURN:
-        angle = math.sqrt(square)
-        return math.sin(0.5 * angle) / angle, math.cos(0.5 * angle)
-    s = 0.25 * square
-    half = 0.5 - s * (1 / 12 - s * (1 / 240 - s * (1 / 10080 - s * (1 / 725760))))
-    return half, 1.0 - s * (0.5 - s * (1 / 24 - s * (1 / 720 - s * (1 / 40320 - s * (1 / 3628800)))))
 
 
 @inline_kernel

@@ -8,7 +8,7 @@ import math
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix, turn_slope
+from factorbus.solver.kernels.model.se3 import half_turn, quat_product, rotation_matrix, turn_slope
 
 
 @inline_kernel
@@ -33,11 +33,8 @@ def move_sim3(x: F64, i: int, step: F64, d: int, out: F64) -> None:
 def turn_quaternion(x: F64, i: int, step: F64, d: int, out: F64) -> None:
     """out = q ⊗ exp(δφ), of unit length; as in `move_se3`."""
     fx, fy, fz = step[d], step[d + 1], step[d + 2]
-    angle = math.sqrt(fx * fx + fy * fy + fz * fz)
-    half = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
-    put_quaternion(
-        quat_product(x[i], x[i + 1], x[i + 2], x[i + 3], half * fx, half * fy, half * fz, math.cos(0.5 * angle)), out, i
-    )
+    half, cosine = half_turn(fx * fx + fy * fy + fz * fz)
+    put_quaternion(quat_product(x[i], x[i + 1], x[i + 2], x[i + 3], half * fx, half * fy, half * fz, cosine), out, i)
 
 
 @inline_kernel
