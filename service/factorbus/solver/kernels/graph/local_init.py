@@ -119,13 +119,18 @@ def gather_system(v: int, f0: int, f1: int, graph: Graph, linear: _Linear, M: F6
             for b in range(a, dim):
                 W[a, b] = W[b, a] = payload[p]
                 p += 1
+        A, g = H[end], H[1 - end, 0]  # of the other end nothing is needed any more
         for a in range(dim):
+            e, g[:] = 0.0, 0.0
             for b in range(dim):
-                chi2 += r[a] * W[a, b] * r[b]
-                for i in range(width):
-                    z[i] -= H[end, a, i] * W[a, b] * r[b]
-                    for j in range(i, width):
-                        M[i, j] += H[end, a, i] * W[a, b] * H[end, b, j]
+                e += W[a, b] * r[b]
+                for j in range(width):
+                    g[j] += W[a, b] * A[b, j]
+            chi2 += r[a] * e
+            for i in range(width):
+                z[i] -= A[a, i] * e
+                for j in range(i, width):
+                    M[i, j] += A[a, i] * g[j]
     return chi2
 
 
