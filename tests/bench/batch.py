@@ -1,6 +1,7 @@
 """Whole graphs, from file values and from composed odometry, by ours and by other libraries.
 
-    factorbus bench batch [--quick] [--only NAME,...] [--solvers NAME;...] [--repetitions N] [--seed N] [--page FILE] [--json]
+    factorbus bench batch [--quick] [--only NAME,...] [--solvers NAME;...] [--repetitions N] [--seed N] [--page FILE]
+                          [--json]
 
 Everyone gets the same graph with the same values in memory; reading and making a library's own objects are not on the
 clock, ordering is.  In one process on one core, the solvers in turn, the least of --repetitions; CPU and wall seconds.

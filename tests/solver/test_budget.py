@@ -200,8 +200,8 @@ def test_a_step_takes_no_more_than_its_budget_where_nothing_far_is_joined() -> N
 def test_a_chord_step_that_does_not_fit_is_not_begun() -> None:
     """It solves all cliques from the factors that it corrects up to the root, whatever is left of the budget.
 
-    Behind it comes what back-substitution has in any case, an eighth of the nine tenths that are planned with, and what it
-    takes to look at those that wait.
+    Behind it comes what back-substitution has in any case, an eighth of the nine tenths that are planned with, and
+    what it takes to look at those that wait.
     """
     budget, shares = 1e7, []
     for seed in (7, 8):
