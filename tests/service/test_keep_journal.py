@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from tested_maps import between
 
+from factorbus.journal.bundle import export_map, import_map
 from factorbus.journal.problems import JournalOption
-from factorbus.journal.store import Store, create
+from factorbus.journal.store import Store, create, open_store
 from factorbus.proto import codec
 from factorbus.proto.closures import decode_suspects
 from factorbus.proto.keep import keep_text
@@ -107,6 +108,12 @@ def test_its_own_inserts_are_counted_with_nobodys(kept: Kept) -> None:
     assert counts["inserts"] == len(BATCHES)
     assert counts["clients"] == 1
     assert counts["records"] == len(BATCHES) + kept.plans
+
+
+def test_a_copy_of_it_in_one_file_can_be_imported(kept: Kept, tmp_path: Path) -> None:
+    export_map(kept.store.path.parent, tmp_path / "m.fbmap")
+    import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
+    assert list(open_store(tmp_path / "other" / "n").records()) == list(kept.store.records())
 
 
 def test_the_policy_is_in_the_journal(kept: Kept) -> None:
