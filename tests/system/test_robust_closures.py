@@ -6,12 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from false_closures import drive_with_false
 from journalled import Services
 from processes import PATIENCE_S
 from tested_service import ran, told, values
 
+from factorbus.cli.driving.columns import merged
 from factorbus.client import Changes, connect
+from factorbus.formats import read, write_graph
 
 
 def test_a_drive_whose_closures_are_weighed(services: Callable[..., Services], tmp_path: Path) -> None:
@@ -37,6 +40,13 @@ def test_a_drive_whose_closures_are_weighed(services: Callable[..., Services], t
         assert "closures are weighed" in ran("stats", "yard", "--connect", endpoint)
         assert "closures weighed" in ran("maps", "--connect", endpoint)
 
+        written = tmp_path / "yard.g2o"
+        saved = json.loads(ran("save", "yard", str(written), "--connect", endpoint, "--json"))
+        missing = sum(row["reason"] == "outweighed" for row in listed["listed"])
+        assert saved["left_out"]["loop closures"] == missing
+        assert f"{missing} loop closures left out: the estimate does not have them" in saved["notes"][0]
+        assert read(written).batch.factor_count == sum(b.factor_count for b in drive.batches) - missing
+
         joined.change(Changes().accept(out[0]).reject(int(found.factors[is_in][0])))
         fork = bus.fork("yard", "what-if")
         assert fork.closures == "robust"
@@ -50,3 +60,13 @@ def test_a_drive_whose_closures_are_weighed(services: Callable[..., Services], t
     running.end(signal.SIGTERM)
     verified = ran("journal", "verify", "--journal", str(tmp_path / "journal"))
     assert {"what-if", "yard"} <= {line.partition(":")[0] for line in verified.splitlines() if "to the bit" in line}
+
+
+@pytest.mark.parametrize("policy", ["test", "robust"])
+def test_a_file_of_a_replay_says_which_closures_it_lacks(tmp_path: Path, policy: str) -> None:
+    drive = drive_with_false(120, 2, 0.4, "random")
+    write_graph(tmp_path / "in.g2o", merged(drive.batches))
+    options = "--closures", policy, "--out", str(tmp_path / "out.g2o"), "--json"
+    replayed = json.loads(ran("replay", str(tmp_path / "in.g2o"), *options))
+    there = [read(tmp_path / name).batch.factor_count for name in ("in.g2o", "out.g2o")]
+    assert replayed["left_out"]["loop closures"] == there[0] - there[1] > 0

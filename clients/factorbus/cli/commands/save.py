@@ -58,6 +58,7 @@ def command(
     check_chosen(target, robot, ids)
     from factorbus.cli.output.console import document
     from factorbus.cli.process.bus import open_bus
+    from factorbus.cli.process.closures_out import closures_out
     from factorbus.formats import FileNotes, recoded, write_whole
 
     form = "jrl" if target.suffix in ROBOT_LOGS else target.suffix.removeprefix(".")
@@ -68,7 +69,9 @@ def command(
             if robots
             else {"": joined.ask.export(form, timeout_s, ids=ids or "auto").result()}
         )
-    files, notes = [], FileNotes()
+        notes = closures_out(joined, timeout_s) if target.suffix in GRAPHS else FileNotes()
+    say(target, notes)
+    files = []
     for letter, exported in texts.items():
         path = target if len(texts) == 1 else target.with_name(f"{target.stem}-{letter or 'none'}{target.suffix}")
         with output_file(path):

@@ -48,7 +48,7 @@ def command(
     if world == "inertial":
         _inertial(poses, seed, out, folder, truth)
         if as_json:
-            _document(world, poses, seed, [folder, truth])
+            _document(world, poses, seed, [folder, truth], notes=[], left_out={})
         return
     if folder is not None:
         raise click.UsageError(f"--folder is of inertial; {world} is one file: --out FILE.g2o")

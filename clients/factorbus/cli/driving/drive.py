@@ -7,13 +7,16 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.problems import BetterOptimum
 from factorbus.proto.roles import poses_aside
+
+if TYPE_CHECKING:
+    from factorbus.formats import FileNotes
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +102,10 @@ class Target(Protocol):
 
     def graph(self) -> Batch:
         """All variables and factors, as they are now."""
+        ...
+
+    def closures_out(self) -> "FileNotes":
+        """What a file of the graph leaves out of the closures of the map."""
         ...
 
     def summary(self) -> dict[str, Any]:

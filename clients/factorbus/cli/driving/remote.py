@@ -5,11 +5,15 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from factorbus.cli.driving.drive import Compared, DriveStep
+from factorbus.cli.process.closures_out import closures_out
 from factorbus.client import Changes, Map, PendingInsert
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Variables
+
+if TYPE_CHECKING:
+    from factorbus.formats import FileNotes
 
 # A step of a large map may take long; a service that is gone is noticed otherwise.
 _ANSWER_S = 600.0
@@ -91,6 +95,10 @@ class RemoteMap:
     def graph(self) -> Batch:
         """The map's graph, from the service."""
         return self._map.graph(timeout_s=_ANSWER_S).batch
+
+    def closures_out(self) -> "FileNotes":
+        """Closures of the map that its graph does not have, from the service."""
+        return closures_out(self._map, _ANSWER_S)
 
     def summary(self) -> dict[str, Any]:
         """What the service says of itself, and the deltas that came here of revisions that were waited for."""

@@ -48,6 +48,7 @@ def write_files(asked: AskedFiles, title: str, drive: ReplayedDrive) -> tuple[li
         ids = numbering if numbering != "ids" else "auto"
         with output_file(asked.out):
             notes = write_graph(asked.out, graph, asked.strict, ids, _truth_of(drive.source, asked.out))
+        notes = notes.and_those(drive.target.closures_out())
         say(asked.out, notes)
         count = f"{counted(graph.variable_count, 'variable')}, {counted(graph.factor_count, 'factor')}"
         print_note(f"{asked.out}: the map written, {count}")
