@@ -1,5 +1,6 @@
 """A map that weighs its closures: stages, states, what a user says, and the journal, whatever comes in which order."""
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,7 +15,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.own_clients import JUDGE
 from factorbus.service.core.events import Stepped, Verdict
 from factorbus.solver.closures import graduation
-from factorbus.solver.closures.graduation import ClosureGraduation
+from factorbus.solver.closures.graduation import ClosureGraduation, own_chi2
 from factorbus.solver.closures.ledger import OUTWEIGHED
 from factorbus.solver.errors import NotFinite
 
@@ -211,6 +212,34 @@ def test_a_stage_whose_step_fails_leaves_final_losses_and_is_tried_again(monkeyp
         made.kill()
     made.insert(Batch((), (right(3, LENGTH),)))
     assert made.states() == {16: "accepted", 17: "accepted"}
+
+
+@pytest.mark.parametrize("fails", range(1, 12))
+def test_where_weighing_fails_between_stages_losses_are_final_and_it_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch, fails: int
+) -> None:
+    made, calls = bent(), itertools.count(1)
+
+    def measured(*arguments: Any) -> np.ndarray:
+        if next(calls) == fails:
+            raise ArithmeticError("by chance")
+        return own_chi2(*arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(graduation, "own_chi2", measured)
+        made.insert(Batch((), (right(1, LENGTH),)))
+        assert next(calls) > fails
+    assert scales(made) == pytest.approx([ClosureGraduation().final_scales["between_se2"]])
+    assert made.states() == {16: "suspect"}
+    assert made.solver.converged
+    made.kill()
+    made.insert(Batch((), (right(3, LENGTH),)))
+    assert made.states() == {16: "accepted", 17: "accepted"}
+    made.kill()
+
+
+def scales(made: TestedMap) -> list[float]:
+    return [float(scale) for group in made.solver.solver.graph()[1] if group.scale is not None for scale in group.scale]
 
 
 def refuse(*_: object) -> None:

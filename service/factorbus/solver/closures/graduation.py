@@ -178,19 +178,33 @@ class _Look:
             yield rows, scales_at(own_chi2(solver(), ledger, rows), mu, c2)
 
     def _carry_out(self, scales: Iterator[_Scales]) -> _Stages:
-        """One stage after the other; where one fails all have the final scale again, and are suspects meanwhile."""
-        scale_of, final = dict[int, float](), float(np.sqrt(self._c2))
-        for rows, scale in scales:
-            before = dict(scale_of)
-            stage = self._stage(rows, scale, scale_of)
-            self._why.update(dict.fromkeys(rows.tolist(), GRADUATED))
-            if stage is not None and not (yield stage):
-                left = np.array(list(before), np.int64)
-                if (back := self._stage(left, np.full(left.size, final), before)) is not None:
-                    yield back
-                self._why.update(dict.fromkeys(rows.tolist(), FAILED))
-                return False
+        """One stage after the other; where one fails all have the final scale again, and are suspects meanwhile.
+
+        Raises what measuring between stages does, after they have it again.
+        """
+        scale_of = dict[int, float]()
+        try:
+            for rows, scale in scales:
+                before = dict(scale_of)
+                stage = self._stage(rows, scale, scale_of)
+                self._why.update(dict.fromkeys(rows.tolist(), GRADUATED))
+                if stage is not None and not (yield stage):
+                    yield from self._go_back(before)
+                    self._why.update(dict.fromkeys(rows.tolist(), FAILED))
+                    return False
+        except Exception:
+            yield from self._go_back(scale_of)
+            raise
         return True
+
+    def _go_back(self, scale_of: dict[int, float]) -> Generator[GraduationStage, bool, None]:
+        """Those whose loss is not the final one have it again, as suspects that wait for another try."""
+        rows, final = np.array(list(scale_of), np.int64), float(np.sqrt(self._c2))
+        stage = self._stage(rows, np.full(rows.size, final), scale_of)
+        if stage is not None:
+            v = stage.verdicts
+            count = v.factors.size
+            yield stage._replace(verdicts=v._replace(states=(SUSPECT,) * count, reasons=(FAILED,) * count))
 
     def _stage(self, rows: I64, scale: F64, scale_of: dict[int, float]) -> GraduationStage | None:
         """Of those whose scale is another than in `scale_of`, or than the final one, as it is noted there."""
