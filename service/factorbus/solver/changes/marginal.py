@@ -5,7 +5,8 @@ it is one linear factor there, linearized at the estimate; or a prior, of a sing
 a separator of more than MOST_JOINED free variables.
 
 Fixed poses are in it too, where there is room: so what hung on one through a pose that goes still hangs on it, in its
-frame, and stays right where it is freed, or moved with the part that it holds.
+frame, and stays right where it is freed, or moved with the part that it holds.  What is said of several among each
+other is a constant, and is not kept: where one is freed later the rest is less certain than it would be.
 """
 
 import numpy as np
