@@ -21,6 +21,7 @@ _TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3}
 _H = 1e-6  # metres and radians of a central difference
 _DONE, _MOST_PASSES, _MOST_DAMPING = 1e-10, 200, 1e12
 _FIRST_DAMPING = 1e-5
+_LEAST_DAMPING = 1e-10  # along what is hardly known an undamped step leads too far, and one with much hardly moves
 _ROUNDING = 1e-14  # of χ²: a hardly damped step that wants to gain less ends, for differences may bar undamped ones
 
 
@@ -70,11 +71,11 @@ class Oracle:
             if damping <= _FIRST_DAMPING and decrease <= wanted * max(chi2, 1.0):
                 return first, min(chi2, reached)
             if reached <= chi2:
-                x, chi2, damping = trial, reached, 0.0 if damping < 1e-6 else 0.1 * damping
+                x, chi2, damping = trial, reached, 0.1 * damping if damping > _LEAST_DAMPING else 0.0
             elif damping > _MOST_DAMPING:
                 break
             else:
-                damping = max(10 * damping, _FIRST_DAMPING)
+                damping = max(10 * damping, _LEAST_DAMPING)
         raise ArithmeticError(f"no optimum after {_MOST_PASSES} passes; χ² is {chi2:.9g}")
 
 
