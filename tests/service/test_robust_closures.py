@@ -30,7 +30,7 @@ def driven(length: int = LENGTH) -> TestedMap:
     return made
 
 
-def bent(length: int = LENGTH) -> TestedMap:
+def distorted(length: int = LENGTH) -> TestedMap:
     """The same with a heading that drifts, so that the first closure does not fit and is graduated."""
     made = TestedMap("robust")
     for batch in corridor(length):
@@ -79,7 +79,7 @@ def test_closures_have_a_loss_and_what_does_not_fit_is_a_suspect_with_its_weight
 
 
 def test_stages_are_entries_and_steps_and_none_has_converged_before_the_last() -> None:
-    made = bent()
+    made = distorted()
     came = made.arrived(Batch((), (right(1, LENGTH),)))
     events, _ = made.solver.apply_whole([came])
     entries = [
@@ -101,7 +101,7 @@ def test_stages_are_entries_and_steps_and_none_has_converged_before_the_last() -
 
 
 def test_on_the_way_reports_say_that_the_map_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, told = bent(), list[tuple[bool, str]]()
+    made, told = distorted(), list[tuple[bool, str]]()
     report_of = type(made.solver)._report_of
 
     def noted(self: Any, *arguments: Any) -> dict[str, Any]:
@@ -120,7 +120,7 @@ def test_on_the_way_reports_say_that_the_map_has_not_converged(monkeypatch: pyte
 
 
 def test_a_journal_is_run_again_by_its_entries_and_not_by_weighing(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = bent()
+    made = distorted()
     made.insert(Batch((), (right(1, LENGTH), between(2, 15, [9.0, 0.0, 1.0]))))
     before = made.states()
     assert before == {16: "accepted", 17: "suspect"}
@@ -191,7 +191,7 @@ def test_closures_with_a_loss_of_their_sender_are_not_weighed() -> None:
 
 
 def test_closures_that_came_without_entries_are_weighed_with_the_next_insert() -> None:
-    made = bent()
+    made = distorted()
     made.insert(Batch((), (right(1, LENGTH), right(4, LENGTH), between(2, 15, [9.0, 0.0, 1.0]))))
     before = made.states()
     made.go_back()
@@ -203,7 +203,7 @@ def test_closures_that_came_without_entries_are_weighed_with_the_next_insert() -
 
 
 def test_a_stage_whose_step_fails_leaves_final_losses_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = bent()
+    made = distorted()
     with monkeypatch.context() as patched:
         patched.setattr("factorbus.service.solving.apply.try_change", refuse)
         (accepted,) = made.insert(Batch((), (right(1, LENGTH),)))
@@ -218,7 +218,7 @@ def test_a_stage_whose_step_fails_leaves_final_losses_and_is_tried_again(monkeyp
 def test_where_weighing_fails_between_stages_losses_are_final_and_it_is_tried_again(
     monkeypatch: pytest.MonkeyPatch, fails: int
 ) -> None:
-    made, calls = bent(), itertools.count(1)
+    made, calls = distorted(), itertools.count(1)
 
     def measured(*arguments: Any) -> np.ndarray:
         if next(calls) == fails:
@@ -281,7 +281,7 @@ def test_in_space_the_same() -> None:
 
 
 def test_an_entry_with_scales_is_what_it_was() -> None:
-    made = bent()
+    made = distorted()
     made.insert(Batch((), (right(1, LENGTH),)))
     for entry in entries_of(made):
         again = decode_closure_entry(encode_closure_entry(entry))
@@ -295,7 +295,7 @@ def test_an_entry_with_scales_is_what_it_was() -> None:
 def test_whatever_happens_ids_stay_and_the_journal_gives_the_same_bits(
     happened: list[tuple[str, int, float]], drift: bool
 ) -> None:
-    made, gone, state, since = (bent() if drift else driven()), set[int](), None, 0
+    made, gone, state, since = (distorted() if drift else driven()), set[int](), None, 0
     for what, n, off in happened:
         closures = sorted(made.states())
         poses = {int(key) for group in made.solver.solver.estimate() for key in group.keys}

@@ -14,7 +14,7 @@ SIMILARITY = POSE3 + ", scale"
 class TangentScalar(NamedTuple):
     """One number of a tangent space: in which order they are, rows and columns of covariances have them.
 
-    unit: "m", "rad", "1/m", "" of a ratio; None: any, as whoever made the variable has it.
+    unit: "m", "rad", "1/m", "" of a ratio; None: that of the variable's maker.
     """
 
     name: str

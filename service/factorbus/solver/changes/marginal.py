@@ -129,7 +129,7 @@ def _as_factors(graph: FactorGraph, separator: list[int], held: int, R: F64, d: 
 def _of_full_rank(R: F64, d: F64, free: int) -> tuple[F64, F64]:
     """R (rank, n), upper triangular, and d that say the same, without directions of which nothing is known.
 
-    free: columns of what is not fixed, by which alone it is told.
+    free: columns of what is not fixed; they alone decide.
     """
     # Without units: what is known of an angle and of a place differ by as much as their scales.
     R, of_fixed = R[:, :free], R[:, free:]

@@ -3,7 +3,7 @@
     1  a new closure goes in with its final loss, in the step of its batch.  Most fit, and nothing follows
     2  one that does not fit is held against the map with the joint covariance of its ends.  d² is what χ² of all the
        rest rises by if the map gives way to it, to first order: within the gate that is less than what its loss counts
-       where the map does not, so it is graduated.  Beyond, the map does not bend to it
+       where the map does not, so it is graduated.  Beyond, the map does not follow it
     3  graduated: its kernel begins quadratic, and so do those of closures whose residuals that moves; a step each for
        μ = 0.12, 0.384, 0.9648 and 1 (`graduated_kernel`)
     4  one with less than a hundredth of its weight is outweighed, and is no factor of the map until it is graduated
@@ -11,7 +11,7 @@
        are graduated together on a copy, and that is done in the map if its χ², with all losses final, is lower then
     6  outweighed ones whose residual has changed are looked at again with the next closure
 
-Deciding is here; whoever has the solver makes the steps, and says whether they went well.
+Deciding is here; the caller has the solver, makes the steps, and says whether they went well.
 """
 
 from collections.abc import Callable, Generator, Iterator, Sequence
