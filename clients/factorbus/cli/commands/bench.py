@@ -45,7 +45,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
                of 10,000 candidates; --quick
     batch      whole graphs from file values and from odometry to the optimum, beside GTSAM and g2o: public data sets,
-               worlds of 10,000 and 100,000 poses; ten minutes; --only, --solvers, --seed; --quick: two minutes
+               worlds of 10,000 and 100,000 poses; an hour; --only, --solvers, --seed; --quick: two minutes
     every-step the χ² of every published estimate over the batch optimum's from there, beside iSAM2's: simulated
                drives, data sets, and steps that turn much of a map; an hour; --no-isam2: a quarter of that;
                --seeds, --seed, --only simulated|data|hard|NAME,...
