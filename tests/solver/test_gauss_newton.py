@@ -19,6 +19,7 @@ class Curve:
         self.chi2s = [self.chi2(self.x)]
         self.factorized: list[float] = []
         self.taken_back: list[np.ndarray] = []
+        self.newtons = 0
 
     def chi2(self, x: np.ndarray) -> float:
         return float(self.r(x) @ self.r(x))
@@ -37,6 +38,16 @@ class Curve:
 
     def step(self) -> np.ndarray:
         return self.delta
+
+    def newton_step(self) -> np.ndarray:
+        """By the Hessian of χ² / 2, which is differences of its gradient."""
+        h = 1e-6 * np.eye(self.x.size)
+        columns = [(self.gradient(self.x + e) - self.gradient(self.x - e)) / 2e-6 for e in h]
+        self.newtons += 1
+        return np.linalg.solve(np.array(columns), -self.gradient(self.x))
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        return self.J(x).T @ self.r(x)
 
     def linearize_at(self, step: np.ndarray) -> float:
         self.there = self.x + step
@@ -119,6 +130,47 @@ def test_steps_that_never_lead_down_are_taken_back(damping: float) -> None:
     assert 1 < first_damped <= 1 + OVER_HILLS.nonmonotone
     assert problem.factorized[first_damped] == (damping or 1e-5)
     assert result.chi2 <= problem.chi2s[0]
+
+
+NEWTON = dataclasses.replace(SETTLE, newton=True)
+
+
+def between_two_ranges() -> Curve:
+    """x of a point between two ranges that are a fifth of what they can be, and a weak wish of where it is: the
+    curvature of χ² is four times what Jacobians say."""
+
+    def r(x: np.ndarray) -> np.ndarray:
+        d = np.hypot(5.0, x[0])
+        return np.array([d - 1.0, d - 1.0, np.sqrt(0.5) * (x[0] - 0.3)])
+
+    return Curve(r, lambda x: np.array([[x[0] / np.hypot(5.0, x[0])]] * 2 + [[np.sqrt(0.5)]]), [0.3])
+
+
+def test_steps_of_newtons_end_where_gauss_newton_leads_away_from_the_optimum() -> None:
+    damped, curved = between_two_ranges(), between_two_ranges()
+    minimize(damped, damped.chi2s[0], 0.0, SETTLE)
+    result = minimize(curved, curved.chi2s[0], 0.0, NEWTON)
+    assert result.converged
+    assert abs(curved.gradient(curved.x)[0]) < 1e-6
+    assert curved.chi2s == sorted(curved.chi2s, reverse=True)
+    assert len(curved.factorized) < len(damped.factorized) / 3
+    assert set(curved.factorized) == {0.0}
+
+
+def test_where_undamped_steps_lead_down_there_are_none_of_newtons() -> None:
+    problem = Curve(lambda x: np.exp(x) - 1.0, lambda x: np.diag(np.exp(x)), [0.5])
+    assert minimize(problem, problem.chi2s[0], 0.0, NEWTON).converged
+    assert problem.newtons == 0
+
+
+def test_damped_steps_follow_the_first_of_newtons_that_does_not_lead_down() -> None:
+    """At 3 the second derivative of arctan² is negative: the step goes uphill, and so do its halves."""
+    problem = arctan([3.0])
+    result = minimize(problem, problem.chi2s[0], 0.5, NEWTON)
+    assert result.converged
+    assert abs(problem.x[0]) < 1e-9
+    assert problem.newtons == 1
+    assert problem.factorized[:2] == [0.0, 0.5]
 
 
 def test_what_another_step_would_take_off_is_told() -> None:

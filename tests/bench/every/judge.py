@@ -1,11 +1,11 @@
 """χ² of an estimate, and of the batch optimum from there, by full passes over the graph as it is after each step.
 
-The optimum is that of Gauss-Newton on all factors, with Levenberg-Marquardt's damping where a step would raise χ²,
-begun at the estimate.  Nothing of the incremental solver takes part: each pass linearizes everything, orders and
+The optimum is that of Gauss-Newton on all factors, with Newton's steps or Levenberg-Marquardt's damping where one would
+raise χ², begun at the estimate.  Nothing of the incremental solver takes part: each pass linearizes everything, orders and
 factorizes it anew.  `oracle` has the same in NumPy and SciPy alone, and the tests hold one against the other.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,8 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.cholesky import Cholesky
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import Symbolic, analyze
+
+from .newton import newton_steps
 
 COARSE, FINE = 1e-5, 1e-10  # of χ²: where the model of one pass is good enough, and where an optimum is one
 _MOST_PASSES = 200
@@ -106,6 +108,8 @@ class Judge:
             if small and damping == 0.0:
                 return first, min(chi2, self._chi2(trial)), trial, passes
             reached = self._chi2(trial)
+            if damping == 0.0 and not reached <= chi2:
+                trial, reached = self._best(x, eta.copy(), chi2)
             if not reached <= chi2:
                 if 0.0 < damping <= _HARDLY_DAMPED and decrease <= _ROUNDING * max(chi2, UNIT):
                     return first, chi2, x, passes  # undamped steps leave a curved valley, and others find nothing more
@@ -114,6 +118,27 @@ class Judge:
             damping = 0.0 if damping < 1e-6 else 0.1 * damping
             x, chi2 = trial, self._linearize(trial)
         return first, chi2, x, _MOST_PASSES
+
+    def _best(self, x: F64, eta: F64, chi2: float) -> tuple[F64, float]:
+        """Where one of Newton's steps leads that lowers χ², and χ² there; infinite where none does."""
+
+        def moved(delta: F64) -> F64:
+            trial = np.empty_like(x)
+            move(self._mark[at.VARIABLES], self._graph.var, x, delta, trial)
+            return trial
+
+        def eta_at(delta: F64) -> F64:
+            self._blocks.relinearize(self._graph, moved(delta))
+            self._blocks.swap_eta()
+            return self._blocks.eta[: eta.size].copy()
+
+        solve: Callable[[F64], F64] = lambda g: self._cholesky.back(self._cholesky.forward(g))  # noqa: E731
+        for delta in newton_steps(eta, eta_at, solve):
+            reached = self._chi2(moved(delta))
+            if reached <= chi2:
+                return moved(delta), reached
+        self._linearize(x)
+        return x, np.inf
 
     def _linearize(self, values: F64) -> float:
         chi2 = self._blocks.relinearize(self._graph, values)

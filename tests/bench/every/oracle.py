@@ -17,11 +17,14 @@ from scipy.spatial.transform import Rotation
 from factorbus.proto.messages import Batch
 from factorbus.solver import Group
 
+from .newton import newton_steps
+
 _TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3}
 _H = 1e-6  # metres and radians of a central difference
 _DONE, _MOST_PASSES, _MOST_DAMPING = 1e-10, 200, 1e12
 _FIRST_DAMPING = 1e-5
 _LEAST_DAMPING = 1e-10  # along what is hardly known an undamped step leads too far, and one with much hardly moves
+_DIFFERENCES = 1e-8  # of χ²: what Jacobians by differences want to gain where neither they nor Newton's steps lower it
 _ROUNDING = 1e-14  # of χ²: a hardly damped step that wants to gain less ends, for differences may bar undamped ones
 
 
@@ -70,6 +73,10 @@ class Oracle:
             wanted = _DONE if damping == 0.0 else _ROUNDING
             if damping <= _FIRST_DAMPING and decrease <= wanted * max(chi2, 1.0):
                 return first, min(chi2, reached)
+            if damping == 0.0 and not reached <= chi2:
+                trial, reached = problem.best(x, chi2)
+                if not reached <= chi2 and decrease <= _DIFFERENCES * max(chi2, 1.0):
+                    return first, chi2
             if reached <= chi2:
                 x, chi2, damping = trial, reached, 0.1 * damping if damping > _LEAST_DAMPING else 0.0
             elif damping > _MOST_DAMPING:
@@ -103,6 +110,22 @@ class _Problem:
 
     def step(self, x: dict[str, F64], damping: float) -> tuple[F64, float]:
         """δ of the normal equations with diagonal Λ (1 + damping), and the decrease of χ² that the model tells."""
+        information, eta = self._normal(x)
+        delta = _solver(csc_array(information + damping * diags_array(information.diagonal())))(eta)
+        return delta, float(delta @ eta)
+
+    def best(self, x: dict[str, F64], chi2: float) -> tuple[dict[str, F64], float]:
+        """Where one of Newton's steps leads that lowers χ², and χ² there; infinite where none does."""
+        information, eta = self._normal(x)
+        for delta in newton_steps(eta, lambda d: self._normal(self.moved(x, d))[1], _solver(information)):
+            trial = self.moved(x, delta)
+            reached = self.chi2(trial)
+            if reached <= chi2:
+                return trial, reached
+        return x, np.inf
+
+    def _normal(self, x: dict[str, F64]) -> tuple[csc_array, F64]:
+        """Λ and η."""
         rows, columns, entries, wanted, count = [], [], [], [], 0
         for f, ends in self._factors:
             r = self._whitened(f, ends, x)
@@ -120,10 +143,7 @@ class _Problem:
             count += r.size
         index = np.concatenate(rows), np.concatenate(columns)
         J, r = csc_array((np.concatenate(entries), index), shape=(count, self.count)), np.concatenate(wanted)
-        information, eta = J.T @ J, J.T @ r
-        damped = csc_array(information + damping * diags_array(information.diagonal()))
-        delta = splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(eta)
-        return delta, float(delta @ eta)
+        return csc_array(J.T @ J), J.T @ r
 
     def moved(self, x: dict[str, F64], delta: F64) -> dict[str, F64]:
         """x ⊞ δ."""
@@ -155,6 +175,10 @@ class _Problem:
             return self._at(f, [*values[:n], boxplus(kind, values[n], delta), *values[n + 1 :]])
 
         return np.stack([(off(c, _H) - off(c, -_H)) / (2 * _H) for c in range(_TANGENT[kind])], axis=2)
+
+
+def _solver(matrix: csc_array) -> Callable[[F64], F64]:
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
 
 
 def boxplus(kind: str, x: F64, delta: F64) -> F64:

@@ -1,6 +1,8 @@
 """Steps that are exact where R is not: conjugate gradients on the factors, preconditioned by R.  MATH (6.4)"""
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +17,47 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 _DAMPINGS = (2.0**-50, 2.0**-46, 2.0**-42, 2.0**-38)
 _ITERATIONS = 500  # at most
 _LEFT = 1e-12  # of the decrease that was found: what is left is no more, by R
+
+
+def precondition_by(factor: Factor, watch: Stopwatch, g: F64) -> tuple[float, F64]:
+    """|R⁻ᵀ g|² and R⁻¹ R⁻ᵀ g."""
+    square = factor.decrease(g, watch)
+    return square, factor.step(watch)
+
+
+def iterate(
+    eta: F64,
+    multiply: Callable[[F64], F64],
+    precondition: Callable[[F64], tuple[float, F64]],
+    left: float,
+    most: int,
+) -> tuple[float, F64]:
+    """(δᵀη, δ) with A δ = η, until what is left is no more than a share of what was found; NaN where A has no numbers.
+
+    multiply: A p.  precondition: gᵀ M⁻¹ g and M⁻¹ g.  Where the curvature pᵀ A p is not positive δ is what was found
+    before; 0 and zeros where that is nothing.
+    """
+    g, x, found = eta.copy(), np.zeros(eta.size), 0.0
+    square, p = precondition(g)
+    if not math.isfinite(square):
+        return square, p
+    for _ in range(most):
+        Ap = multiply(p)
+        curvature = float(p @ Ap)
+        if not math.isfinite(curvature):
+            return math.nan, p
+        if curvature <= 0.0:
+            break
+        size = square / curvature
+        x += size * p
+        g -= size * Ap
+        found += size * square
+        before = square
+        square, z = precondition(g)
+        if not square > left * found:
+            break
+        p = z + square / before * p
+    return found, x
 
 
 class ConjugateGradients:
@@ -45,31 +88,9 @@ class ConjugateGradients:
             return self._solve(eta, watch)
 
     def _solve(self, eta: F64, watch: Stopwatch) -> float:
-        g, x = eta.copy(), np.zeros(eta.size)
-        square, p = self._precondition(g, watch)
-        if not math.isfinite(square):
-            self._step = p
-            return square
-        found = 0.0
-        for _ in range(_ITERATIONS):
-            Ap = self._multiply(p)
-            curvature = float(p @ Ap)
-            if not math.isfinite(curvature):
-                self._step = p
-                return math.nan
-            if curvature <= 0.0:
-                break
-            size = square / curvature
-            x += size * p
-            g -= size * Ap
-            found += size * square
-            before = square
-            square, z = self._precondition(g, watch)
-            if not square > _LEFT * found:
-                break
-            p = z + square / before * p
+        precondition = partial(precondition_by, self._factor, watch)
+        found, self._step = iterate(eta, self._multiply, precondition, _LEFT, _ITERATIONS)
         watch.lap("solve")
-        self._step = x
         return found
 
     def step(self, watch: Stopwatch) -> F64:
@@ -104,11 +125,6 @@ class ConjugateGradients:
     def memory_bytes(self) -> int:
         """As `Factor.memory_bytes`."""
         return self._factor.memory_bytes() + 5 * self._damped.nbytes
-
-    def _precondition(self, g: F64, watch: Stopwatch) -> tuple[float, F64]:
-        """|R⁻ᵀ g|² and R⁻¹ R⁻ᵀ g."""
-        square = self._factor.decrease(g, watch)
-        return square, self._factor.step(watch)
 
     def _multiply(self, x: F64) -> F64:
         graph = self._graph

@@ -16,6 +16,7 @@ _MOST_DAMPING = 1e12
 # A predicted decrease below this share of χ², or below this, may be lost in the rounding of χ² itself.
 _ROUNDING = 1e-11
 _ROUNDING_FLOOR = 1e-12
+_HALVES = 3  # of a step of Newton's
 # Below these δ, too, is rounding: a settled map that is settled again does not move.
 _EXACT, _EXACT_FLOOR = 1e-21, 1e-24
 
@@ -33,6 +34,11 @@ class LeastSquares(Protocol):
 
     def step(self) -> F64:
         """The δ of the last `decrease`."""
+        ...
+
+    def newton_step(self) -> F64 | None:
+        """δ by the Hessian of χ², terms of second order included, where R is that of an undamped Λ; None: it has none
+        to give."""
         ...
 
     def linearize_at(self, step: F64) -> float:
@@ -69,6 +75,7 @@ class StoppingRule:
     polish: this number of steps more at most, below what χ² can show, while each is to gain less than the one before.
     nonmonotone: where an undamped step would raise χ², it is made all the same, and others after it until χ² is lower
     than before them: at most this many in all.  If it never is, they are taken back, and damped ones follow.
+    newton: where an undamped step would raise χ², one of Newton's is tried before damped ones, until one of these does.
     """
 
     tolerance: float
@@ -77,6 +84,7 @@ class StoppingRule:
     reuse: float = 0.0
     polish: int = 0
     nonmonotone: int = 0
+    newton: bool = False
 
     def is_negligible(self, decrease: float, chi2: float) -> bool:
         """Whether a decrease of χ² is not worth a step.  False for NaN."""
@@ -119,11 +127,12 @@ def minimize(
     it is; else Λ has changed and is factorized anew.  6. After a damped step that gained nothing an undamped factor
     tells what is left: where residuals are large, undamped steps may lead away from the very optimum.
     With `have_factor` the loop begins with a factor that is there, as after an undamped step.  With non-monotone steps
-    it begins without `damping`, which counts once they have been taken back.
+    or Newton's it begins without `damping`, which counts once they have been taken back.
     tell: called after every step that was accepted, with what the step was damped by.
     """
-    hills = rule.nonmonotone
-    result = Minimization(chi2, 0.0 if hills else damping)
+    hills, newton = rule.nonmonotone, rule.newton
+    begin, later = (0.0, damping) if hills or newton else (damping, 0.0)
+    result = Minimization(chi2, begin)
     decrease, solved, fresh = problem.decrease() if have_factor else 0.0, have_factor, False
     for _ in range(rule.limit):
         if not solved:
@@ -152,10 +161,16 @@ def minimize(
                 hills = hills - made if made else 0
                 if made:
                     tell(result)
+                if made or newton:
                     continue
-                if damping > 0.0:
-                    result.damping = damping
+            elif undamped and newton:
+                newton = _try_newton(problem, result)
+                if newton:
+                    tell(result)
                     continue
+            if undamped and later > 0.0:
+                result.damping, later = later, 0.0
+                continue
             if not _damp_more(result):
                 break
             continue
@@ -235,6 +250,21 @@ def _go_over_hill(problem: LeastSquares, result: Minimization, reached: float, m
         reached = problem.linearize_at(problem.step())
     problem.go_back()
     return 0
+
+
+def _try_newton(problem: LeastSquares, result: Minimization) -> bool:
+    """A step of Newton's, or the first of its halves that lowers χ²; False: none did."""
+    step = problem.newton_step()
+    if step is None:
+        return False
+    for _ in range(_HALVES + 1):
+        reached = problem.linearize_at(step)
+        if reached < result.chi2:
+            problem.accept()
+            result.chi2, result.iterations = reached, result.iterations + 1
+            return True
+        step = 0.5 * step
+    return False
 
 
 def _polish(problem: LeastSquares, result: Minimization, most: int) -> None:

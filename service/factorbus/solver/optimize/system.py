@@ -1,6 +1,7 @@
 """The least-squares problem of a graph as Gauss-Newton sees it: a point, normal equations, a step, a trial."""
 
 import math
+from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -12,7 +13,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.retract import differing, move
 from factorbus.solver.kernels.sparse.partial_cholesky import ROUNDING
-from factorbus.solver.optimize.conjugate import ConjugateGradients
+from factorbus.solver.optimize.conjugate import ConjugateGradients, iterate, precondition_by
 from factorbus.solver.optimize.factor import Factor
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.anchors import find_loose, find_loose_by_themselves
@@ -24,6 +25,10 @@ R = TypeVar("R", bound=Factor)
 # How many times what counts as rounding a pivot has to be for R without damping to be tried again: with 4 steps beside
 # links of 1e-6 m that had gone back to R were left open.
 _FAR = 256.0
+# Of (6.5): the largest entry, in metres and radians, of what gradients are a difference along; the share of the decrease
+# at which its iterations end, and at most how many there are.
+_DIFFERENCE, _NEWTON_LEFT, _NEWTON_ITERATIONS = 1e-6, 1e-4, 50
+_LEAST_NORMAL = 2.0**-1022
 _FREE_DIRECTION = (
     "together they leave it a direction to move in; add a prior, or a factor that measures what these do not"
 )
@@ -96,6 +101,29 @@ class System(Generic[R]):
     def step(self) -> F64:
         """The δ of the last `decrease`."""
         return self._solver.step(self._watch)
+
+    def newton_step(self) -> F64 | None:
+        """δ with H δ = η, H the Hessian of χ² with its terms of second order; None where R has lost to rounding.
+
+        By conjugate gradients, R of the last undamped `factorize` as preconditioner; H p is a difference of gradients.
+        Where H is not positive definite δ is along what of it was found to be, or that of Gauss-Newton.  MATH (6.5)
+        """
+        if self.rounded:
+            return None
+        eta = self.blocks.eta[: self.graph.counts[at.SCALARS]].copy()
+
+        def multiply(p: F64) -> F64:
+            size = _DIFFERENCE / max(float(np.abs(p).max()), _LEAST_NORMAL)
+            if not math.isfinite(self.linearize_at(size * p)):
+                return np.full_like(eta, np.nan)
+            self.blocks.swap_eta()
+            there = self.blocks.eta[: eta.size].copy()
+            self.blocks.swap_eta()
+            return (eta - there) / size
+
+        precondition = partial(precondition_by, self.factor, self._watch)
+        found, step = iterate(eta, multiply, precondition, _NEWTON_LEFT, _NEWTON_ITERATIONS)
+        return step if found > 0.0 else precondition(eta)[1]
 
     def linearize_at(self, step: F64) -> float:
         """χ² at x ⊞ δ, linearized there aside."""
