@@ -6,9 +6,8 @@ from bench.every.drives import WORLDS
 from factorbus.solver import Options, Solver
 from factorbus.solver.divergence import copied
 
-# Ranges to points on whose wrong side a drive was found, so that residuals are hundreds of σ; from this step on the
-# minimum that the map was in is none any more.
-SEED, FIRST, LAST = 1721504858, 124, 134
+# Ranges to points on whose wrong side a drive was found, so that residuals are tens of σ.
+SEED, FIRST, LAST = 17, 154, 162
 
 
 def reachable(solver: Solver) -> float:
@@ -18,14 +17,17 @@ def reachable(solver: Solver) -> float:
 
 
 def test_steps_behind_one_that_had_not_converged_say_it_only_where_it_is_so() -> None:
-    solver, told = Solver(Options()), []
+    solver, told, open_at = Solver(Options()), [], []
     for k, batch in enumerate(WORLDS["ranges_2d"].make(300, SEED)):
         solver.stage(batch)
         report = solver.step()
         if FIRST <= k <= LAST:
+            ratio = report.chi2 / reachable(solver)
             told.append(report.strategy)
-            assert not report.converged or report.chi2 <= 1.001 * reachable(solver)
+            open_at += [] if report.converged else [ratio]
+            assert not report.converged or ratio <= 1.001
         if k == LAST:
             break
-    assert "tree" in told
-    assert report.chi2 > 1.003 * reachable(solver)
+    assert told[-1] == "tree"
+    assert report.converged
+    assert max(open_at) > 1.003

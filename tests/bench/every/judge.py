@@ -1,8 +1,8 @@
 """χ² of an estimate, and of the batch optimum from there, by full passes over the graph as it is after each step.
 
 The optimum is that of Gauss-Newton on all factors, with Newton's steps or Levenberg-Marquardt's damping where one would
-raise χ², begun at the estimate.  Nothing of the incremental solver takes part: each pass linearizes everything, orders and
-factorizes it anew.  `oracle` has the same in NumPy and SciPy alone, and the tests hold one against the other.
+raise χ², begun at the estimate.  Nothing of the incremental solver takes part: each pass linearizes everything, orders
+and factorizes it anew.  `oracle` has the same in NumPy and SciPy alone, and the tests hold one against the other.
 """
 
 from collections.abc import Callable, Iterable

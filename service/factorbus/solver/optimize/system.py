@@ -25,8 +25,8 @@ R = TypeVar("R", bound=Factor)
 # How many times what counts as rounding a pivot has to be for R without damping to be tried again: with 4 steps beside
 # links of 1e-6 m that had gone back to R were left open.
 _FAR = 256.0
-# Of (6.5): the largest entry, in metres and radians, of what gradients are a difference along; the share of the decrease
-# at which its iterations end, and at most how many there are.
+# Of (6.5): the largest entry, in metres and radians, of what gradients are a difference along; the share of the
+# decrease at which its iterations end, and at most how many there are.
 _DIFFERENCE, _NEWTON_LEFT, _NEWTON_ITERATIONS = 1e-6, 1e-4, 50
 _LEAST_NORMAL = 2.0**-1022
 _FREE_DIRECTION = (
