@@ -25,7 +25,7 @@ $(READY): pyproject.toml $(SETUP)
 
 # bench: other libraries to compare with, which the tests have as oracles.
 $(READY_DEV): pyproject.toml $(SETUP)
-	@bash deploy/setup/environment.sh $(VENV) service,viz,watch,record,gateway,ros2,dev,bench,docs
+	@bash deploy/setup/environment.sh $(VENV) service,metis,viz,watch,record,gateway,ros2,dev,bench,docs
 	@touch $(READY) $@
 
 demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as processes on the bus

@@ -267,7 +267,7 @@ def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPa
     assert re.fullmatch(r"if wanted: \S.* install .*\[watch\]'", found.mend)
     assert "without watch" in found.seen
     monkeypatch.setattr("factorbus.cli.output.exits.find_spec", lambda _: None)
-    assert checks.extras().seen == "none installed; without service, cholmod, viz, watch, record, gateway, ros2"
+    assert checks.extras().seen == "none installed; without service, cholmod, metis, viz, watch, record, gateway, ros2"
 
 
 @pytest.mark.parametrize(("answer", "state"), [(0, "ok"), (5, "warn"), (-1, "ok")])

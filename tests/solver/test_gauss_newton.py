@@ -157,6 +157,34 @@ def test_steps_of_newtons_end_where_gauss_newton_leads_away_from_the_optimum() -
     assert set(curved.factorized) == {0.0}
 
 
+def test_steps_of_newtons_come_where_those_of_gauss_newton_gain_little_each() -> None:
+    """Two ranges that are longer than can be push outwards: the curvature of χ² is a fifth of what Jacobians say."""
+
+    def r(x: np.ndarray) -> np.ndarray:
+        d = np.hypot(5.0, x[0])
+        return np.array([d - 9.0, d - 9.0, np.sqrt(2.0) * (x[0] - 0.01)])
+
+    def J(x: np.ndarray) -> np.ndarray:
+        return np.array([[x[0] / np.hypot(5.0, x[0])]] * 2 + [[np.sqrt(2.0)]])
+
+    slow, quick = Curve(r, J, [0.01]), Curve(r, J, [0.01])
+    assert minimize(slow, slow.chi2s[0], 0.0, SETTLE).converged
+    assert minimize(quick, quick.chi2s[0], 0.0, NEWTON).converged
+    assert 0 < quick.newtons <= 3
+    assert len(quick.factorized) < len(slow.factorized) / 3
+    assert set(quick.factorized) == {0.0}
+    np.testing.assert_allclose(quick.x, slow.x, atol=1e-5)
+
+
+def test_far_from_the_end_there_are_none_however_little_steps_gain() -> None:
+    rule = dataclasses.replace(NEWTON, tolerance=1e-11)
+    assert not rule.is_slow(decrease=0.1, last=0.1, chi2=1.0)
+    assert not rule.is_slow(decrease=1e-5, last=np.inf, chi2=1.0)
+    assert not rule.is_slow(decrease=1e-8, last=1e-5, chi2=1.0)
+    assert rule.is_slow(decrease=1e-5, last=2e-5, chi2=1.0)
+    assert rule.is_slow(decrease=2e-5, last=1e-5, chi2=1.0)
+
+
 def test_where_undamped_steps_lead_down_there_are_none_of_newtons() -> None:
     problem = Curve(lambda x: np.exp(x) - 1.0, lambda x: np.diag(np.exp(x)), [0.5])
     assert minimize(problem, problem.chi2s[0], 0.0, NEWTON).converged

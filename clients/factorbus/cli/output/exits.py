@@ -30,6 +30,7 @@ EXIT_CODES = {
 EXTRAS = {
     "service": ("numba", "llvmlite", "scipy", "prometheus_client"),
     "cholmod": ("sksparse",),
+    "metis": ("pymetis",),
     "viz": ("matplotlib",),
     "watch": ("rerun",),
     "record": ("foxglove",),

@@ -17,6 +17,8 @@ _MOST_DAMPING = 1e12
 _ROUNDING = 1e-11
 _ROUNDING_FLOOR = 1e-12
 _HALVES = 3  # of a step of Newton's
+# Steps that gain less than this share of χ² are near the end; as many of Gauss-Newton as one of Newton's takes time for.
+_NEAR, _MANY = 1e-3, 12
 # Below these δ, too, is rounding: a settled map that is settled again does not move.
 _EXACT, _EXACT_FLOOR = 1e-21, 1e-24
 
@@ -75,7 +77,8 @@ class StoppingRule:
     polish: this number of steps more at most, below what χ² can show, while each is to gain less than the one before.
     nonmonotone: where an undamped step would raise χ², it is made all the same, and others after it until χ² is lower
     than before them: at most this many in all.  If it never is, they are taken back, and damped ones follow.
-    newton: where an undamped step would raise χ², one of Newton's is tried before damped ones, until one of these does.
+    newton: where an undamped step would raise χ², one of Newton's is tried before damped ones; and where undamped ones
+    near the end gain hardly less than the one before; until one of Newton's would raise χ².
     """
 
     tolerance: float
@@ -89,6 +92,13 @@ class StoppingRule:
     def is_negligible(self, decrease: float, chi2: float) -> bool:
         """Whether a decrease of χ² is not worth a step.  False for NaN."""
         return decrease <= self.tolerance * chi2 + self.floor
+
+    def is_slow(self, decrease: float, last: float, chi2: float) -> bool:
+        """Whether steps that gain this, and `last` before, have some way to go to where one is negligible."""
+        if not decrease <= _NEAR * chi2 or not math.isfinite(last):
+            return False
+        left = decrease / (self.tolerance * chi2 + self.floor)
+        return decrease >= last or left > (last / decrease) ** _MANY
 
 
 @dataclass(slots=True)
@@ -134,6 +144,7 @@ def minimize(
     begin, later = (0.0, damping) if hills or newton else (damping, 0.0)
     result = Minimization(chi2, begin)
     decrease, solved, fresh = problem.decrease() if have_factor else 0.0, have_factor, False
+    last = math.inf
     for _ in range(rule.limit):
         if not solved:
             result.factorizations += 1
@@ -148,6 +159,15 @@ def minimize(
         if undamped and rule.is_negligible(decrease, result.chi2):
             result.converged = True
             break
+        if undamped and fresh:
+            if newton and rule.is_slow(decrease, last, result.chi2):
+                newton = _try_newton(problem, result)
+                if newton:
+                    tell(result)
+                    last = math.inf
+                    continue
+                problem.decrease()
+            last = decrease
         reached = problem.linearize_at(problem.step())
         solved = False
         if not reached <= result.chi2:

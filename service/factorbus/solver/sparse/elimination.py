@@ -11,9 +11,11 @@ from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.cholesky import Cholesky
 from factorbus.solver.sparse.cholmod import factorize_by_cholmod
+from factorbus.solver.sparse.dissection import analyze_whole
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
+_TIMES = 5  # that a whole graph is eliminated, about
 # Groups of the constrained ordering.
 _ANYWHERE, _RECENT_LANDMARK, _LAST_POSE = 0, 1, 2
 
@@ -23,8 +25,9 @@ class Elimination:
 
     NOT_KEPT = ("_options",)
 
-    def __init__(self, options: Options) -> None:
-        self._options = options
+    def __init__(self, options: Options, whole: bool = False) -> None:
+        """whole: of a graph that is eliminated as a whole, and not step by step; see `analyze_whole`."""
+        self._options, self._whole = options, whole
         self._cholesky = Cholesky()
         self._pattern = (0, 0)
         self.symbolic: Symbolic | None = None
@@ -72,6 +75,10 @@ class Elimination:
         pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
         if self.symbolic is None or pattern != self._pattern:
             dims = graph.dims[: pattern[0]]
+            if self._whole:
+                self.symbolic, self._pattern = analyze_whole(dims, blocks.rows, blocks.cols, _TIMES), pattern
+                watch.lap("symbolic")
+                return self.symbolic
             group = (
                 constraint(graph, self._options.tuning.constrain_recent_poses)
                 if self._options.tuning.constrain_last_pose

@@ -36,6 +36,7 @@ class Nodes:
 
     R (N, d, d), t (N, d); of what is no node of this space the identity and the origin.
     pose, point, fixed (N,): what each is; the map is a fixed pose.
+    rank (N,): the order in which they are eliminated, of what is free; None: any.
     """
 
     R: F64
@@ -43,16 +44,18 @@ class Nodes:
     pose: np.ndarray
     point: np.ndarray
     fixed: np.ndarray
+    rank: I64 | None
 
 
-def averaged(graph: FactorGraph) -> list[F64]:
+def averaged(graph: FactorGraph, order: I64 | None = None) -> list[F64]:
     """Values for a graph, laid out as its own, from averaged rotations: none if it has no poses or nothing holds them.
 
     Two if it has points whose places are measured: rotations by themselves, and together with places.  The values that
     the graph has count only where the factors leave something open, as how far along a ray a point is.
+    order: the block columns of Λ as R eliminates them, where that is known: good for all of its parts, too.
     """
     kinds = graph.var[: graph.counts[at.VARIABLES], at.V_KIND]
-    spaces = [_Averaging(graph, space) for space in (PLANE, SPACE) if (kinds == space.pose).any()]
+    spaces = [_Averaging(graph, space, order) for space in (PLANE, SPACE) if (kinds == space.pose).any()]
     found = []
     for together in (False, True) if any(each.has_places for each in spaces) else (False,):
         values = graph.values.copy()
@@ -65,8 +68,8 @@ def averaged(graph: FactorGraph) -> list[F64]:
 class _Averaging:
     """One space of a graph: what its factors say, and what it is before anything is averaged."""
 
-    def __init__(self, graph: FactorGraph, space: PoseSpace) -> None:
-        self._graph, self._space, self._nodes = graph, space, _nodes(graph, space)
+    def __init__(self, graph: FactorGraph, space: PoseSpace, order: I64 | None) -> None:
+        self._graph, self._space, self._nodes = graph, space, _nodes(graph, space, order)
         relations, self._directions = relations_of(graph, space)
         self.has_places = bool((self._nodes.point[relations.b] & (relations.a != MAP)).any())
         self._relations = tied(graph, space, relations, self._nodes.R, self._nodes.t)
@@ -100,9 +103,9 @@ class _Averaging:
         known[_firsts(label)] = True
         held = directions.where(label[directions.b] == MAP)
         if together and not label.any():
-            R = rotations_with_places(relations, held, nodes.fixed, nodes.pose, nodes.R, nodes.t)
+            R = rotations_with_places(relations, held, nodes.fixed, nodes.pose, nodes.R, nodes.t, nodes.rank)
         else:
-            R = averaged_rotations(relations, held, known, nodes.R)
+            R = averaged_rotations(relations, held, known, nodes.R, nodes.rank)
         if R is None:
             return None
         # 2. Such components to where they lie in the map.
@@ -111,7 +114,7 @@ class _Averaging:
         return R, _place(relations, nodes, R, np.ones(label.size, bool))
 
 
-def _nodes(graph: FactorGraph, space: PoseSpace) -> Nodes:
+def _nodes(graph: FactorGraph, space: PoseSpace, order: I64 | None) -> Nodes:
     count, d = int(graph.counts[at.VARIABLES]), space.dim
     var, size = graph.var[:count], 3 if d == 2 else 7
     R, t = np.tile(np.eye(d), (count + 1, 1, 1)), np.zeros((count + 1, d))
@@ -125,7 +128,15 @@ def _nodes(graph: FactorGraph, space: PoseSpace) -> Nodes:
     t[point] = graph.values[var[point[1:], at.V_AT, None] + np.arange(d)]
     fixed[1 + variables_aside(graph.fac[: graph.counts[at.FACTORS]])] = True  # not in the map: as they are
     pose[0] = fixed[0] = True
-    return Nodes(R, t, pose, point, fixed)
+    return Nodes(R, t, pose, point, fixed, None if order is None else _ranks(var[:, at.V_COLUMN], order))
+
+
+def _ranks(columns: I64, order: I64) -> I64:
+    """(N,): of each node the place of its block column in `order`; of what has none, −1."""
+    rank, place = np.full(1 + columns.size, -1), np.empty(order.size, np.int64)
+    place[order] = np.arange(order.size)
+    rank[1:][columns >= 0] = place[columns[columns >= 0]]
+    return rank
 
 
 def _firsts(label: I64) -> I64:
@@ -166,7 +177,7 @@ def _place(relations: Relations, nodes: Nodes, R: F64, inside: np.ndarray) -> F6
     label = components_of(used, nodes.fixed)
     known = nodes.fixed | ~inside
     known[_firsts(label)] = True
-    return solve_positions(used, R, nodes.t, known)
+    return solve_positions(used, R, nodes.t, known, nodes.rank)
 
 
 def _write(graph: FactorGraph, space: PoseSpace, nodes: Nodes, R: F64, t: F64, values: F64) -> None:

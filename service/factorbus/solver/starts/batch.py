@@ -91,8 +91,9 @@ def _check_memory(need: int, search: BatchSearch, events: BatchEvents) -> None:
 
 def _begun(descents: Descents, given: bool, wanted: str) -> list[Descent]:
     """All starts that are wanted and have a χ², the lowest first.  Raises NotFinite, or BadOption, if none has."""
-    graph, begun, failed = descents.graph, [], None
-    for start, values in _values_of_starts(graph, given, wanted):
+    begun: list[Descent] = []
+    failed: NotFinite | None = None
+    for start, values in _values_of_starts(descents, given, wanted):
         try:
             begun.append(descents.begin(start, values))
         except NotFinite as problem:
@@ -105,13 +106,14 @@ def _begun(descents: Descents, given: bool, wanted: str) -> list[Descent]:
     return [each for n, each in enumerate(begun) if not any(_is_beside(descents, each, lower) for lower in begun[:n])]
 
 
-def _values_of_starts(graph: FactorGraph, given: bool, wanted: str) -> Iterator[tuple[str, F64]]:
+def _values_of_starts(descents: Descents, given: bool, wanted: str) -> Iterator[tuple[str, F64]]:
+    graph = descents.graph
     if wanted == VALUES or (wanted == BEST and given):
         yield VALUES, graph.values
     if wanted in (BEST, ODOMETRY):
         yield ODOMETRY, _composed(graph)
     if wanted in (BEST, ROTATIONS):
-        yield from ((ROTATIONS, values) for values in averaged(graph))
+        yield from ((ROTATIONS, values) for values in averaged(graph, descents.order()))
 
 
 def _rounded(chi2: float) -> float:

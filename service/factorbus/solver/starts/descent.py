@@ -11,7 +11,7 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.inc_l.incremental import Incremental
-from factorbus.solver.kernels.jit.compile import F64
+from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
 from factorbus.solver.optimize.gauss_newton import Minimization, StoppingRule, minimize
@@ -20,6 +20,7 @@ from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
 from factorbus.solver.sparse.elimination import Elimination
+from factorbus.solver.sparse.symbolic import Symbolic
 from factorbus.solver.starts.same_place import SamePlace
 from factorbus.solver.starts.search import ROTATIONS, STARTS, BatchEvents, BatchSearch, NoEvents
 from factorbus.solver.tuning import Tuning
@@ -27,6 +28,9 @@ from factorbus.solver.tuning import Tuning
 _POLISH = 100
 # Without polishing, a search ends where another step would lower χ² by less than this share of it.
 _UNPOLISHED = 1e-11
+# Where R takes more than this number of operations for each scalar, it makes further steps while each is to gain less
+# than this share of the one before: they take a fifth of one that makes R anew.
+_DEAR, _REUSE = 3e4, 0.5
 # Tries at a time: of the lowest start first, of others; and at most of one that is not the best when another converged.
 _FIRST_CHUNK, _CHUNK, _MOST_OF_OTHERS = 8, 4, 60
 # Two starts are on the way to the same optimum when they are in the same place (`SamePlace`), or differ in χ² by less
@@ -76,13 +80,13 @@ class Descents:
         tuning = options.tuning
         self._rule = StoppingRule(
             tuning.converge_tolerance if search.polish else _UNPOLISHED, 1e-8 * tuning.chi2_epsilon, 0,
-            polish=_POLISH if search.polish else 0,
+            polish=_POLISH if search.polish else 0, newton=True,
         )  # fmt: skip
         self._hills = tuning.max_nonmonotone_steps
         self._search, self._events = search, events
         self.graph, none = graph, (0,) * at.COUNTS
         self.are_close = SamePlace(graph)
-        self._system = System(graph, Incremental(Elimination(options), options))
+        self._system = System(graph, Incremental(Elimination(options, whole=True), options))
         self._suspects = find_undetermined(graph, none)
         if self._suspects.size and (free := find_unanchored(graph, none)) >= 0:
             raise self._system.underconstrained(
@@ -92,13 +96,19 @@ class Descents:
             )
         self._system.blocks.extend(graph, none)
 
+    def order(self) -> I64:
+        """The block columns of Λ as R eliminates them."""
+        return self._analyzed().order
+
     def memory_bytes(self) -> int:
         """Bytes that the graph, Λ and R take, and the most that a start takes beside these; Λ is ordered for it."""
-        elimination, counts = self._system.factor.elimination, self.graph.counts
-        symbolic = elimination.analyze(self.graph, self._system.blocks, Stopwatch(None))
+        symbolic, counts = self._analyzed(), self.graph.counts
         pattern = symbolic.blocks.nbytes + symbolic.fronts.nbytes + symbolic.runs.nbytes + symbolic.separator.nbytes
         factors, averaging = 8 * symbolic.arena, _AVERAGED_FACTOR * int(counts[at.FACTORS]) + 4 * symbolic.arena
         return self.graph.memory_bytes() + self._system.memory_bytes() - factors + pattern + max(factors, averaging)
+
+    def _analyzed(self) -> Symbolic:
+        return self._system.factor.elimination.analyze(self.graph, self._system.blocks, Stopwatch(None))
 
     def begin(self, start: str, values: F64) -> Descent:
         """A start.  Raises NotFinite where it has no χ²."""
@@ -147,7 +157,9 @@ class Descents:
         tries = self._search.max_iterations - descent.tries
         if not alone:
             tries = min(tries, _FIRST_CHUNK if first and not descent.tries else _CHUNK)
-        rule = replace(self._rule, limit=tries, nonmonotone=self._hills if descent.damping == 0.0 else 0)
+        dear = self._analyzed().flops > _DEAR * int(graph.counts[at.SCALARS])
+        hills = self._hills if descent.damping == 0.0 else 0
+        rule = replace(self._rule, limit=tries, nonmonotone=hills, reuse=_REUSE if dear else 0.0)
         result = minimize(system, descent.chi2, descent.damping, rule, tell=self._telling(descent))
         if result.failed >= 0 and result.iterations == 0:
             raise system.underconstrained(system.variable_of(result.failed))
@@ -183,7 +195,7 @@ class Descents:
 def _is_hopeless(descent: Descent, other: Descent) -> bool:
     """Whether a start that has not been tried need not be."""
     return (
-        other.converged
+        (other.converged or other.left <= _SAME_CHI2 * other.chi2)
         and other.start == ROTATIONS
         and other.began <= _TIGHT * other.chi2
         and not descent.tries

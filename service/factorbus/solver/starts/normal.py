@@ -9,14 +9,17 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.sparse.cholesky import Cholesky
-from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.dissection import analyze_whole
 from factorbus.solver.sparse.symbolic import analyze
 
 
 class Normal:
-    """n unknowns of d numbers each; pairs (i, j) (m,) of different ones, in any order and as often as they come."""
+    """n unknowns of d numbers each; pairs (i, j) (m,) of different ones, in any order and as often as they come.
 
-    def __init__(self, count: int, dim: int, i: I64, j: I64) -> None:
+    rank (n,): eliminated from the lowest on, as where these unknowns are some of a graph that is ordered already.
+    """
+
+    def __init__(self, count: int, dim: int, i: I64, j: I64, rank: I64 | None = None) -> None:
         low, high = np.minimum(i, j), np.maximum(i, j)
         key = low * count + high
         self._sorted = np.argsort(key, kind="stable")
@@ -26,7 +29,10 @@ class Normal:
         pairs, all_of = key[self._begin], np.arange(count)
         rows, cols = np.concatenate([all_of, pairs // count]), np.concatenate([all_of, pairs % count])
         dims = np.full(count, dim, np.int64)
-        self._symbolic = analyze(dims, rows, cols, order(dims, rows, cols))
+        if rank is None:
+            self._symbolic = analyze_whole(dims, rows, cols)
+        else:
+            self._symbolic = analyze(dims, rows, cols, np.argsort(rank, kind="stable"))
         self._offsets = dim * dim * np.arange(rows.size)
         self._cholesky, self._count, self._dim = Cholesky(), count, dim
 

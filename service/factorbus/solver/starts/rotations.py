@@ -14,11 +14,13 @@ from factorbus.solver.starts.relations import Directions, Relations
 from factorbus.solver.starts.rotation_matrices import nearest_rotations
 
 
-def averaged_rotations(relations: Relations, directions: Directions, known: np.ndarray, R: F64) -> F64 | None:
+def averaged_rotations(
+    relations: Relations, directions: Directions, known: np.ndarray, R: F64, rank: I64 | None = None
+) -> F64 | None:
     """Rotations (N, d, d) of all nodes; None: nothing holds some of them.
 
     known (N,): those that stay what they are in R (N, d, d).  Every node that is not known is one of a relation with a
-    `turn`; relations without are not looked at.
+    `turn`; relations without are not looked at.  rank (N,): the order in which nodes are eliminated; None: any.
     """
     used = relations.where((relations.turn > 0.0) & ~(known[relations.a] & known[relations.b]))
     number, (count, d) = np.where(known, -1, np.cumsum(~known) - 1), (int(np.count_nonzero(~known)), R.shape[1])
@@ -29,7 +31,7 @@ def averaged_rotations(relations: Relations, directions: Directions, known: np.n
     both = (i >= 0) & (j >= 0)
     across, there = direction_terms(directions, number, count)
     diagonal = (summed(i, w, count) + summed(j, w, count))[:, None, None] * np.eye(d) + across
-    normal = Normal(count, d, i[both], j[both])
+    normal = Normal(count, d, i[both], j[both], None if rank is None else rank[~known])
     if not normal.factorize(diagonal, (-w[:, None, None] * used.R)[both]):
         return None
     right = _right(used, i, j, R, count) + there

@@ -8,7 +8,7 @@ d + 1 numbers, the same normal equations for each r.
 
 import numpy as np
 
-from factorbus.solver.kernels.jit.compile import F64
+from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.starts.normal import Normal, summed
 from factorbus.solver.starts.relations import Directions, Relations
 from factorbus.solver.starts.rotation_matrices import nearest_rotations
@@ -16,11 +16,18 @@ from factorbus.solver.starts.rotations import direction_terms
 
 
 def rotations_with_places(
-    relations: Relations, directions: Directions, known: np.ndarray, pose: np.ndarray, R: F64, t: F64
+    relations: Relations,
+    directions: Directions,
+    known: np.ndarray,
+    pose: np.ndarray,
+    R: F64,
+    t: F64,
+    rank: I64 | None = None,
 ) -> F64 | None:
     """Rotations (N, d, d) of all nodes; None: nothing holds some of them.
 
     known, pose (N,): nodes that stay at R (N, d, d) and t (N, d); those that have a rotation.
+    rank (N,): the order in which nodes are eliminated; None: any.
     """
     used = relations.where(~(known[relations.a] & known[relations.b]))
     free = np.zeros(known.size, bool)
@@ -38,7 +45,7 @@ def rotations_with_places(
     diagonal = summed(i, At @ WA, count) + summed(j, Bt @ WB, count)
     diagonal[:, :d, :d] += across
     diagonal[np.flatnonzero(~pose[free]), :d, :d] = np.eye(d)  # a point has no rotation
-    normal = Normal(count, d + 1, i[both], j[both])
+    normal = Normal(count, d + 1, i[both], j[both], None if rank is None else rank[free])
     if not normal.factorize(diagonal, -(At @ WB)[both]):
         return None
     here = np.concatenate([R, t[:, :, None]], axis=2)  # (N, d, d + 1): row r is what is known of row r

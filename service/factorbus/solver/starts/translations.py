@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.solver.kernels.jit.compile import F64
+from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.starts.normal import Normal, summed
 from factorbus.solver.starts.relations import Relations
 from factorbus.solver.starts.rotation_matrices import angles_of, residuals_of
@@ -12,10 +12,11 @@ _PRIOR_SHARE = 1e-6
 _LEAST = 1e-300
 
 
-def solve_positions(relations: Relations, R: F64, t: F64, known: np.ndarray) -> F64:
+def solve_positions(relations: Relations, R: F64, t: F64, known: np.ndarray, rank: I64 | None = None) -> F64:
     """Places (N, d) of all nodes, of least χ² with these rotations (N, d, d).
 
-    known (N,): those that stay where they are in t (N, d); so do those that no relation names.
+    known (N,): those that stay where they are in t (N, d); so do those that no relation names.  rank (N,): the order
+    in which nodes are eliminated; None: any.
     """
     used = relations.where(~(known[relations.a] & known[relations.b]))
     free = np.zeros(known.size, bool)
@@ -27,7 +28,7 @@ def solve_positions(relations: Relations, R: F64, t: F64, known: np.ndarray) -> 
     number = np.where(free, np.cumsum(free) - 1, -1)
     i, j = number[used.a], number[used.b]
     both = (i >= 0) & (j >= 0)
-    normal = Normal(count, d, i[both], j[both])
+    normal = Normal(count, d, i[both], j[both], None if rank is None else rank[free])
     turn, seen = R[used.a], used.t[:, :, None]
     W = turn @ used.t_information @ turn.transpose(0, 2, 1)
     v = (turn @ seen - R[used.b] @ used.lever[:, :, None])[:, :, 0]
