@@ -1,12 +1,12 @@
 """Whole graphs from 10,000 to 1,000,000 poses: time, memory, and how they grow.
 
-    factorbus bench large [--poses N,...] [--seed N] [--peer-up-to N] [--cores N] [--page FILE] [--json]
+    factorbus bench large [--poses N,...] [--seed N] [--peer-up-to N] [--cores N] [--page=FILE] [--json]
 
 Streets, drawn anew at every run (--seed N draws them again), each in a process of its own: the graph in memory, without
 values, to the optimum in memory, as `factorbus solve` finds it from composed odometry and averaged rotations, with
-worker threads on as many cores as there are.  Memory: the most that was resident, less what the graph took before; said:
-what `factorbus solve` says beforehand.  Up to --peer-up-to poses GTSAM's Levenberg-Marquardt (multifrontal Cholesky)
-begins at the same averaged rotations, which are not on its clock.
+worker threads on as many cores as there are.  Memory: the most that was resident, less what the graph took before;
+said: what `factorbus solve` says beforehand.  Up to --peer-up-to poses GTSAM's Levenberg-Marquardt (multifrontal
+Cholesky) begins at the same averaged rotations, which are not on its clock.
 
 The exponent is the slope of log time over log poses, from the smallest graph to the largest.  Held against: an exponent
 of wall time of at most 1.25, an end where another step takes off less than 1e-6 of χ², and GTSAM's time.  The exit code
@@ -43,10 +43,10 @@ from factorbus.solver import BatchSearch, solve_batch
 from factorbus.solver.starts.search import NoEvents
 
 _MOST_EXPONENT, _LEFT, _THERE = 1.25, 1e-6, 1.01
-_WORDS = """Streets without values, in memory, to their optimum in memory, as `factorbus solve` finds it: from averaged rotations or
-composed odometry, whichever is better, both found on the way. Memory is what it takes beside the graph; *said* is what
-`factorbus solve` says beforehand, with the graph. GTSAM's Levenberg-Marquardt (multifrontal Cholesky) begins at the same
-averaged rotations, which are not on its clock."""
+_WORDS = """Streets without values, in memory, to their optimum in memory, as `factorbus solve` finds it: from averaged
+rotations or composed odometry, whichever is better, both found on the way. Memory is what it takes beside the graph;
+*said* is what `factorbus solve` says beforehand, with the graph. GTSAM's Levenberg-Marquardt (multifrontal
+Cholesky) begins at the same averaged rotations, which are not on its clock."""
 _SMALL = 30_000  # poses up to which a time is the least of three
 
 

@@ -1,4 +1,4 @@
-"""An order by nested dissection: a permutation that leaves R less to do in large plane graphs, for whole graphs only."""
+"""An order by nested dissection: it leaves R less to do in large plane graphs, and is for whole graphs only."""
 
 from importlib.util import find_spec
 from itertools import islice

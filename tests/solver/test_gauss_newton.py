@@ -164,10 +164,10 @@ def test_steps_of_newtons_come_where_those_of_gauss_newton_gain_little_each() ->
         d = np.hypot(5.0, x[0])
         return np.array([d - 9.0, d - 9.0, np.sqrt(2.0) * (x[0] - 0.01)])
 
-    def J(x: np.ndarray) -> np.ndarray:
+    def jacobian(x: np.ndarray) -> np.ndarray:
         return np.array([[x[0] / np.hypot(5.0, x[0])]] * 2 + [[np.sqrt(2.0)]])
 
-    slow, quick = Curve(r, J, [0.01]), Curve(r, J, [0.01])
+    slow, quick = Curve(r, jacobian, [0.01]), Curve(r, jacobian, [0.01])
     assert minimize(slow, slow.chi2s[0], 0.0, SETTLE).converged
     assert minimize(quick, quick.chi2s[0], 0.0, NEWTON).converged
     assert 0 < quick.newtons <= 3

@@ -17,7 +17,8 @@ _MOST_DAMPING = 1e12
 _ROUNDING = 1e-11
 _ROUNDING_FLOOR = 1e-12
 _HALVES = 3  # of a step of Newton's
-# Steps that gain less than this share of χ² are near the end; as many of Gauss-Newton as one of Newton's takes time for.
+# Steps that gain less than this share of χ² are near the end; as many of Gauss-Newton's take the time of one of
+# Newton's.
 _NEAR, _MANY = 1e-3, 12
 # Below these δ, too, is rounding: a settled map that is settled again does not move.
 _EXACT, _EXACT_FLOOR = 1e-21, 1e-24
