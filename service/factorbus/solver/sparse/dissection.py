@@ -38,7 +38,8 @@ def dissect(dims: I64, rows: I64, cols: I64) -> I64:
     off = rows != cols
     ends = np.concatenate([rows[off], cols[off]]), np.concatenate([cols[off], rows[off]])
     graph = csr_array((np.ones(ends[0].size, np.int8), ends), shape=(len(dims), len(dims)))
-    adjacency = pymetis.CSRAdjacency(graph.indptr.astype(np.int32), graph.indices.astype(np.int32))
+    begins, others = (np.asarray(each, np.int32).ravel() for each in (graph.indptr, graph.indices))
+    adjacency = pymetis.CSRAdjacency(begins, others)
     weights = None if (dims == dims[0]).all() else dims.astype(np.int32)
     found, _ = pymetis.nested_dissection(adjacency, vweights=weights)
     return np.asarray(found, np.int64)
