@@ -15,7 +15,7 @@ from factorbus.client.changes import some_of
 from factorbus.client.draft import batch_of
 from factorbus.client.merging import fit_into
 from factorbus.client.uncertainty import association_question, factors_of, paired, why_question
-from factorbus.proto.asking import Covariances
+from factorbus.proto.asking import CovarianceGroup, Covariances
 from factorbus.proto.messages import Accepted, Batch, Estimate, MapGraph
 from factorbus.proto.problems import BadLoss, BadOption, BadShape, ClosedHere, Problem
 from factorbus.proto.symbols import symbol
@@ -305,6 +305,21 @@ def test_what_is_looked_up_and_not_there_is_a_problem_and_a_key_error(kitchen: M
         assert isinstance(missing.value, Problem)
         assert missing.value.code == "unknown_variable"
         assert str(missing.value).startswith(said)
+
+
+def test_an_estimate_and_covariances_have_their_keys(kitchen: Map) -> None:
+    kitchen.insert(POINT)
+    assert list(kitchen.estimate) == ["l1"]
+    assert [kitchen.estimate[key].tolist() for key in kitchen.estimate] == [[1.0, 0.0]]
+    keys = np.array([symbol("x", 1), symbol("l", 2), 7])
+    answer = Covariances(1, 1, "diagonal", (CovarianceGroup("point2", keys, np.ones((3, 2, 2))),))
+    assert list(answer) == ["x1", "l2", "7"]
+    assert all(key in answer for key in answer)
+    for missing in ("x9", "no key"):
+        assert missing not in answer
+        assert missing not in kitchen.estimate
+        with pytest.raises(KeyError):
+            answer[missing]
 
 
 def test_a_revision_that_has_not_come_is_no_silence(kitchen: Map) -> None:

@@ -1,6 +1,7 @@
 """The pure parts of the client: what a reply means, numbering, following deltas, drafting."""
 
 import math
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from factorbus.client.draft import Draft
 from factorbus.client.following import Following
 from factorbus.client.held_values import HeldValues
+from factorbus.client.pending_insert import PendingInsert, raise_unseen
 from factorbus.client.replies import Again, AnswerReply, Failure, Silence, TimedOut, interpret_reply
 from factorbus.client.window import Window
 from factorbus.proto.codec import encode_problem
@@ -95,6 +97,21 @@ def test_numbers_go_up_by_one_and_the_window_fills() -> None:
     assert window.idle
     assert window.take_refused() == [("b", refusal)]
     assert window.take_refused() == []
+
+
+def test_of_several_refusals_the_first_is_raised_with_the_others() -> None:
+    def pending(seen: bool) -> PendingInsert:
+        made = PendingInsert(cast("Any", None), 1, 1.0)
+        made.seen = seen
+        return made
+
+    known, first, second, third = (Refused(code, code, {}) for code in ("looked_at", "a", "b", "b"))
+    raise_unseen([(pending(True), known)])
+    with pytest.raises(Refused) as raised:
+        raise_unseen([(pending(True), known), *((pending(False), each) for each in (first, second, third))])
+    assert raised.value is first
+    assert first.others == (second, third)
+    assert raised.value.__notes__ == ["2 further inserts refused: 2 b; the first of them: b [b]"]
 
 
 def test_an_insert_waits_only_for_one_that_is_still_being_sent() -> None:
@@ -315,6 +332,8 @@ def test_a_draft_becomes_columns() -> None:
         (lambda d: d.prior_point2("l0", (1, 0), information=[1, 0]), BadShape, "upper triangle"),
         (lambda d: d.factor("between_se2", ("x0",), (1, 0, 0), sigmas=(1, 1, 1)), BadShape, "keys: 1; wanted 2"),
         (lambda d: d.variable("se4", "x0"), UnknownKind, "se4"),
+        (lambda d: d.range_se2("x0", "l0", (1, 2), sigmas=0.1), BadShape, r"measured: shape \(2,\); wanted \(1,\)"),
+        (lambda d: d.heading_se2("x0", (1, 2), sigmas=0.1), BadShape, r"measured: shape \(2,\); wanted \(1,\)"),
     ],
 )
 def test_a_draft_refuses_what_cannot_be_meant(draw: object, problem: type[Problem], text: str) -> None:

@@ -141,8 +141,12 @@ def test_gnss_is_a_position_east_north_and_up_of_the_origin() -> None:
 
 def test_places_that_are_none_are_refused() -> None:
     add = Draft().gnss
-    with pytest.raises(BadShape, match="latitude 100"):
+    with pytest.raises(BadOption, match="gnss x0: place: latitude 100; wanted -90 to 90"):
         add("x0", 100, 0, 0, origin=ORIGIN, sigmas=[1] * 3)
+    with pytest.raises(BadOption, match="gnss x0: place: longitude 820; wanted -360 to 360"):
+        add("x0", 50, 820, 0, origin=ORIGIN, sigmas=[1] * 3)
+    with pytest.raises(BadOption, match="gnss x0: origin: longitude -820"):
+        add("x0", 50, 8, 0, origin=(50, -820, 0), sigmas=[1] * 3)
     with pytest.raises(NotFiniteNumbers):
         add("x0", 50, float("nan"), 0, origin=ORIGIN, sigmas=[1] * 3)
     with pytest.raises(BadShape, match="origin"):

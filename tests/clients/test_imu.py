@@ -86,6 +86,20 @@ def test_samples_in_other_units_are_warned_of(factors: list[float], said: str) -
     assert [Path(each.filename).name for each in warned] == ["test_imu.py"]
 
 
+def test_times_in_place_of_durations_are_warned_of() -> None:
+    times = np.tile(SAMPLES[:1], (20, 1))
+    for first in (0.01, 1.7e9):
+        times[:, 0] = first + 0.01 * np.arange(len(times))
+        with pytest.warns(ImplausibleSamples, match="are these times"):
+            Draft().imu(A, B, times, noise=NOISE)
+
+
+def test_what_is_implausible_is_warned_of_where_samples_are_integrated_before_they_are_sent() -> None:
+    with pytest.warns(ImplausibleSamples, match="degrees per second") as warned:
+        preintegrate_samples(SAMPLES * [1, 1e4, 1e4, 1e4, 1, 1, 1], NOISE)
+    assert [Path(each.filename).name for each in warned] == ["test_imu.py"]
+
+
 @pytest.mark.filterwarnings("error")
 def test_free_fall_and_a_hard_turn_are_not() -> None:
     Draft().imu(A, B, SAMPLES * [1, 1, 1, 1, 0.01, 0, 0.01], noise=NOISE)

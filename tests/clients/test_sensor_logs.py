@@ -204,6 +204,7 @@ BAD: dict[str, tuple[str, Any, str]] = {
     ),
     "no quaternion": ("odom0/data.csv", _line(4, "1700000001000000000,0,0,0,2,0,0,0"), "quaternion has length 2"),
     "latitude": ("gps0/data.csv", _line(3, "1700000001000000000,148,11,5,1,1,1"), "2. fix: latitude 148"),
+    "longitude": ("gps0/data.csv", _line(3, "1700000001000000000,48,1100,5,1,1,1"), "2. fix: .*, longitude 1100"),
     "mount": ("odom0/sensor.yaml", lambda file: file.write_text("T_BS: [1, 2]\n"), "T_BS of 2 numbers"),
     "noise": ("imu0/sensor.yaml", lambda file: file.write_text("gyroscope_noise_density: -1\n"), "gyroscope"),
     "no row": ("imu0/data.csv", lambda file: file.write_text("#\n"), "no row at all"),

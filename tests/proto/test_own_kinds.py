@@ -218,8 +218,10 @@ def test_python_cannot_decide_by_an_expression() -> None:
     def f(a: SE2, z: Vector[1]):
         return a.position if a.heading else z
 
-    with pytest.raises(BadExpression, match=r"no value while it is written; wanted select\(a - b, x, y\)"):
+    with pytest.raises(BadExpression, match=r"no value while it is written; wanted select\(a - b, x, y\)") as refused:
         factor(f)
+    assert isinstance(refused.value, Problem)
+    assert refused.value.code == "unknown_kind"
 
 
 # What is written first, and the way to write it that the refusal has; a is an se2, p a point2, v a vector3.

@@ -53,6 +53,8 @@ def observation_with(k2: float) -> Batch:
     return batch
 
 
+LANDMARK = Variables("point2", np.array([2]))
+
 # What every map of these tests holds: pose 0 (fixed), pose 1, landmark 100, and a pose in space 200.
 REFUSED = {
     "unknown variable kind": ("unknown_kind", Batch((Variables("se4", np.array([2])),))),
@@ -317,3 +319,24 @@ def test_angles_are_wrapped_and_quaternions_made_unit() -> None:
     values = {int(key): v for g in solver.estimate() for key, v in zip(g.keys, g.values, strict=True)}
     assert -np.pi <= values[7][2] < np.pi
     assert np.linalg.norm(values[8][3:]) == pytest.approx(1.0, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("batch", "said"),
+    [
+        (REFUSED["key taken"][1], "variable 1 exists already"),
+        (REFUSED["key twice in the batch"][1], "variable 2 comes twice in one insert"),
+        (REFUSED["key twice in two groups"][1], "variable 2 comes twice in one insert"),
+        (Batch((LANDMARK,)), "variable 2 has no value and no factor of its batch is on it"),
+        (
+            Batch(
+                (Variables("point2", np.array([2])),),
+                (Factors("range_se2", np.array([[0, 2]]), np.ones((1, 1)), np.ones((1, 1))),),
+            ),
+            r"variable 2 has no value and what is on it in its batch, range_se2 \(0, 2\), gives it none",
+        ),
+    ],
+)
+def test_a_refusal_says_where_the_other_is_and_what_was_tried(batch: Batch, said: str) -> None:
+    with pytest.raises(errors.SolverError, match=said):
+        small_map().stage(batch)

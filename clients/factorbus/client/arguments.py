@@ -66,6 +66,11 @@ def as_numbers(what: str, given: Any, wanted: str = "numbers", *, copy: bool = T
         raise BadShape(what, repr(given)[:80], wanted) from None
 
 
+def as_row(number: Any) -> Any:
+    """One number as a row of one; what is a row already as it is, so that an error says the shape that was given."""
+    return number if isinstance(number, list | tuple) or (isinstance(number, np.ndarray) and number.ndim) else [number]
+
+
 def all_finite(what: str, numbers: F64) -> F64:
     """`numbers`, if none of them is a NaN or an infinity.  Raises NotFiniteNumbers."""
     if not np.isfinite(numbers).all():

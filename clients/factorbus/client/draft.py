@@ -10,7 +10,15 @@ from typing import Unpack
 
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import all_finite, as_numbers, checked_flag, checked_keywords, checked_row, of_type
+from factorbus.client.arguments import (
+    all_finite,
+    as_numbers,
+    as_row,
+    checked_flag,
+    checked_keywords,
+    checked_row,
+    of_type,
+)
 from factorbus.client.certainty import (
     Certainty,
     FeatureCertainty,
@@ -203,7 +211,7 @@ class Draft:
         covariance= (3, 3) of these, m², or sigmas= (3,), metres.  lever=, offset=, twist= as in `position_se2`.
         frame=: the key of the map's pose in that frame; without, the map itself has x to the east and y to the north.
         """
-        there = enu((latitude, longitude, height), origin)
+        there = enu((latitude, longitude, height), origin, f"gnss {format_symbol(key_number(key))}: ")
         return self._add(positioned("position_se3", key, there, with_information(key, certainty)))
 
     def velocity_frame_se2(self, frame: Key, velocity: Key, measured: ArrayLike, **sure: Unpack[Certainty]) -> Draft:
@@ -216,7 +224,7 @@ class Draft:
 
     def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane looks, in the map: theta (radians)."""
-        return self.factor("heading_se2", (key,), [theta], **certainty)
+        return self.factor("heading_se2", (key,), as_row(theta), **certainty)
 
     def attitude_se3(
         self, key: Key, seen: ArrayLike, *, direction: ArrayLike = DOWN, **sure: Unpack[Certainty]
@@ -232,23 +240,23 @@ class Draft:
 
     def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """How far a point2 is from the pose (metres)."""
-        return self._seen("range_se2", (pose, point), [distance], certainty)
+        return self._seen("range_se2", (pose, point), as_row(distance), certainty)
 
     def range_se3(self, pose: Key, point: Key, distance: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """How far a point3 is from the pose (metres)."""
-        return self._seen("range_se3", (pose, point), [distance], certainty)
+        return self._seen("range_se3", (pose, point), as_row(distance), certainty)
 
     def range_between_se2(self, first: Key, second: Key, distance: float, **certainty: Unpack[RangeCertainty]) -> Draft:
         """How far two poses in the plane are apart (metres): robots, or a robot and an anchor with an orientation."""
-        return self._add(sensed("range_between_se2", (first, second), [distance], certainty, RangeCertainty))
+        return self._add(sensed("range_between_se2", (first, second), as_row(distance), certainty, RangeCertainty))
 
     def range_between_se3(self, first: Key, second: Key, distance: float, **certainty: Unpack[RangeCertainty]) -> Draft:
         """How far two poses in space are apart (metres)."""
-        return self._add(sensed("range_between_se3", (first, second), [distance], certainty, RangeCertainty))
+        return self._add(sensed("range_between_se3", (first, second), as_row(distance), certainty, RangeCertainty))
 
     def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[SensorCertainty]) -> Draft:
         """Where a point2 is to be seen from the pose (radians, from the x axis to the left)."""
-        return self._seen("bearing_se2", (pose, point), [bearing], certainty)
+        return self._seen("bearing_se2", (pose, point), as_row(bearing), certainty)
 
     def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[SensorCertainty]) -> Draft:
         """Where a point3 is to be seen from the pose: a vector of any length in its frame; sigmas: nearly radians."""
@@ -264,7 +272,8 @@ class Draft:
 
         samples (n, 7), n up to 2000: duration (s), gyroscopes (rad/s), accelerometers (m/s²), as it measured them, from
         pose to pose (`cut_samples`); the service integrates them at every linearization.  At rest they read +9.8 along
-        the axis that points up (specific force, not gravity).  ImplausibleSamples warns of g and of degrees.
+        the axis that points up (specific force, not gravity).  ImplausibleSamples warns of g, of degrees
+        and of times in place of durations.
         gravity: in the map, m/s², or the key of a vector3 (how long: the kind `length_vector3`).
         bias: where the noise of the samples is propagated, the best guess of it.
         mount: the IMU's pose on the robot, x y z qx qy qz qw, or the key of an se3; without, it is the robot's.

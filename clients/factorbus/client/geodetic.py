@@ -14,28 +14,28 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import all_finite, as_numbers
 from factorbus.proto.arrays import F64
-from factorbus.proto.problems import BadShape
+from factorbus.proto.problems import BadOption, BadShape
 
 SEMI_MAJOR_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
+MOST_LONGITUDE = 360.0  # degrees: from -180 to 180 and from 0 to 360 are both in use
 _E2 = FLATTENING * (2.0 - FLATTENING)
 _NEWTON = 6
 
 
-def enu(place: ArrayLike, origin: ArrayLike) -> F64:
+def enu(place: ArrayLike, origin: ArrayLike, where: str = "") -> F64:
     """Metres (3,) east, north and up of `origin`, of a place; both latitude, longitude (degrees), height (metres).
 
-    Heights are above the ellipsoid, as receivers report them beside those above sea level.  Raises BadShape,
-    NotFiniteNumbers.
+    Heights are above the ellipsoid, as receivers report them beside those above sea level.  where: before what an error
+    says.  Raises BadShape, BadOption, NotFiniteNumbers.
     """
-    there, here = _checked("place", place), _checked("origin", origin)
-    return _axes(here) @ (ecef(there) - ecef(here))
+    return _enu(_checked(f"{where}place", place), _checked(f"{where}origin", origin))
 
 
 def geodetic(east_north_up: ArrayLike, origin: ArrayLike) -> F64:
     """Latitude, longitude (degrees), height (metres) of metres (3,) east, north and up of `origin`: `enu` backwards.
 
-    Newton's steps on (1) and (2); near the ground three are enough to the last digit.  Raises BadShape,
+    Newton's steps on (1) and (2); near the ground three are enough to the last digit.  Raises BadShape, BadOption,
     NotFiniteNumbers.
     """
     here, wanted = _checked("origin", origin), all_finite("east_north_up", as_numbers("east_north_up", east_north_up))
@@ -43,7 +43,7 @@ def geodetic(east_north_up: ArrayLike, origin: ArrayLike) -> F64:
         raise BadShape("east_north_up", f"shape {wanted.shape}", "(3,): metres")
     place = here.copy()
     for _ in range(_NEWTON):
-        left = _axes(place) @ (_axes(here).T @ (wanted - enu(place, here)))
+        left = _axes(place) @ (_axes(here).T @ (wanted - _enu(place, here)))
         s = np.sin(np.radians(place[0]))
         N = SEMI_MAJOR_M / np.sqrt(1.0 - _E2 * s * s)
         meridian = N * (1.0 - _E2) / (1.0 - _E2 * s * s)
@@ -55,8 +55,15 @@ def geodetic(east_north_up: ArrayLike, origin: ArrayLike) -> F64:
 
 def ecef(place: ArrayLike) -> F64:
     """X Y Z (3,), metres, of latitude, longitude (degrees), height (metres).  (1)"""
-    given = _checked("place", place)
-    (s, sin_east), (c, cos_east), height = *_sines(given), given[2]
+    return _ecef(_checked("place", place))
+
+
+def _enu(there: F64, here: F64) -> F64:
+    return _axes(here) @ (_ecef(there) - _ecef(here))
+
+
+def _ecef(place: F64) -> F64:
+    (s, sin_east), (c, cos_east), height = *_sines(place), place[2]
     N = SEMI_MAJOR_M / np.sqrt(1.0 - _E2 * s * s)
     return np.array([(N + height) * c * cos_east, (N + height) * c * sin_east, (N * (1.0 - _E2) + height) * s])
 
@@ -79,10 +86,11 @@ def _sines(place: F64) -> tuple[F64, F64]:
 
 
 def _checked(what: str, place: ArrayLike) -> F64:
-    """Raises BadShape, NotFiniteNumbers."""
+    """Raises BadShape, BadOption, NotFiniteNumbers."""
     given = all_finite(what, as_numbers(what, place))
     if given.shape != (3,):
         raise BadShape(what, f"shape {given.shape}", "(3,): latitude, longitude (degrees), height (metres)")
-    if abs(given[0]) > 90.0:
-        raise BadShape(what, f"latitude {given[0]:g}", "-90 to 90 degrees: latitude, longitude, height")
+    for name, angle, most in (("latitude", given[0], 90.0), ("longitude", given[1], MOST_LONGITUDE)):
+        if abs(angle) > most:
+            raise BadOption(what, f"{name} {angle:g}", f"-{most:g} to {most:g} degrees: latitude, longitude, height")
     return given

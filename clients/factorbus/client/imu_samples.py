@@ -19,11 +19,16 @@ _STANDARD = 9.80665  # m/s²
 # free fall, where there is still less.
 _IN_G = 0.5, 1.6
 _LARGEST = 40.0 * _STANDARD  # m/s², a median of it: beyond what sensors measure, unless it is mm/s² or thousandths of g
+# A sample that lasts longer, seconds, or so many of which each lasts longer than the one before: times, not durations.
+_LONGEST_S, _IN_A_ROW = 60.0, 8
 _FASTEST = 70.0  # rad/s, 4,000 °/s: the widest range of gyroscopes
 
 
 class ImplausibleSamples(UserWarning):
-    """Samples of an IMU that are most likely in other units.  `warnings.filterwarnings` silences it."""
+    """Samples of an IMU that are most likely in other units, or times where durations are wanted.
+
+    `warnings.filterwarnings` silences it.
+    """
 
 
 def refuse_gaps(times: F64, held: F64, end_s: float, longest_s: float | None) -> None:
@@ -56,7 +61,7 @@ def refuse_not_finite(what: str, rows: F64) -> None:
     raise NotFiniteNumbers(what, f"{rows[row, column]} in sample {row}, {_COLUMNS[column]}{more}")
 
 
-def warn_implausible(rows: F64, gravity: F64) -> None:
+def warn_implausible(rows: F64, gravity: F64, stacklevel: int = 4) -> None:
     """ImplausibleSamples, where gravity (3,) is about that of the Earth.  rows (n, 7): checked samples.
 
     A wrong sign is not seen here: which way is up in the samples depends on the pose.  The text is much the same for
@@ -64,14 +69,20 @@ def warn_implausible(rows: F64, gravity: F64) -> None:
     """
     wrong = implausible_units(rows, gravity)
     if wrong:
-        warnings.warn(f"imu: samples: {'; '.join(wrong)}", ImplausibleSamples, stacklevel=4)
+        warnings.warn(f"imu: samples: {'; '.join(wrong)}", ImplausibleSamples, stacklevel)
 
 
 def implausible_units(rows: F64, gravity: F64) -> list[str]:
-    """What in samples (n, 7), or none, looks as if it had other units than rad/s and m/s²."""
+    """What in samples (n, 7), or none, looks as if it had other units than s, rad/s and m/s², or was times."""
+    held = rows[:, 0]
     turning = float(np.linalg.norm(rows[:, 1:4], axis=1).max())
     force = float(np.median(np.linalg.norm(rows[:, 4:], axis=1)))
     wrong = []
+    if held.max() > _LONGEST_S or (len(held) >= _IN_A_ROW and (np.diff(held) > 0.0).all()):
+        wrong.append(
+            f"they last {held[0]:.3g} s, ... {held[-1]:.3g} s: are these times? Wanted is how long each sample lasts, "
+            "as cut_samples has it"
+        )
     if turning > _FASTEST:
         wrong.append(f"gyroscopes say {turning:.1g} rad/s, more than any measures: are they in degrees per second?")
     if np.linalg.norm(gravity) > 0.5 * _STANDARD and _IN_G[0] <= force <= _IN_G[1]:

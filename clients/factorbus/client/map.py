@@ -20,7 +20,7 @@ from factorbus.client.link import Link
 from factorbus.client.map_row import MapRow
 from factorbus.client.merging import Merged, as_trusted, fit_into
 from factorbus.client.mirror import Mirror
-from factorbus.client.pending_insert import PendingInsert, encoded
+from factorbus.client.pending_insert import PendingInsert, encoded, raise_unseen
 from factorbus.client.present_clients import present_clients
 from factorbus.client.questions import Questions, logged
 from factorbus.client.renaming_kinds import saying_how_to_rename
@@ -193,7 +193,8 @@ class Map:
     def flush(self, timeout_s: float | None = None) -> None:
         """Wait until everything sent is answered, and the mirror has it.
 
-        Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`.
+        Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`, whose
+        `others` are the further ones.
         """
         timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         with self._lock:
@@ -203,9 +204,7 @@ class Map:
                     f"map {self.name!r}", timeout_s, f"{counted(left, 'insert')} without an answer, still being sent"
                 )
             refused = self._window.take_refused()
-        for pending_insert, refusal in refused:
-            if not pending_insert.seen:
-                raise refusal
+        raise_unseen(refused)
         self._catch_up(timeout_s)
 
     def wait_converged(self, timeout_s: float | None = None) -> None:

@@ -4,8 +4,8 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, suppress
 from numbers import Integral
 from typing import Any
 
@@ -70,11 +70,13 @@ class Mirror:
         return self.find(key)[1]
 
     def __contains__(self, key: str | int) -> bool:
-        try:
-            self[key]
-        except KeyError:
-            return False
-        return True
+        with suppress(KeyError):
+            return self.find(key) is not None
+        return False
+
+    def __iter__(self) -> Iterator[str]:
+        """The keys of all variables of one revision, such as "x12": kind by kind, and of a kind in their order."""
+        return iter([format_symbol(key) for held, _ in self.snapshot().columns.values() for key in held.tolist()])
 
     def __len__(self) -> int:
         with self._lock:

@@ -1,5 +1,7 @@
 """What stands for an insert that is on its way."""
 
+from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import Future
 
 from factorbus.client.arguments import checked_seconds
@@ -7,7 +9,8 @@ from factorbus.client.request_sender import Request
 from factorbus.proto.codec import encode_insert
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Insert
-from factorbus.proto.problems import TooLarge, Unavailable
+from factorbus.proto.problems import Problem, TooLarge, Unavailable
+from factorbus.wording import counted
 
 
 class PendingInsert:
@@ -46,6 +49,19 @@ class PendingInsert:
         except TimeoutError:
             self.seen = False
             raise NoAnswerYet(self, timeout_s) from None
+
+
+def raise_unseen(refused: Sequence[tuple[PendingInsert, Problem]]) -> None:
+    """Raises the first refusal of an insert whose answer nobody has looked at; the further ones are its `others`."""
+    unseen = [refusal for pending_insert, refusal in refused if not pending_insert.seen]
+    if not unseen:
+        return
+    first, *others = unseen
+    first.others = tuple(others)
+    if others:
+        codes = ", ".join(f"{count} {code}" for code, count in Counter(each.code for each in others).items())
+        first.add_note(f"{counted(len(others), 'further insert')} refused: {codes}; the first of them: {others[0]}")
+    raise first
 
 
 def encoded(insert: Insert) -> bytes:

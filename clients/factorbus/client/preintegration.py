@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import all_finite, as_numbers, checked_row, of_type, seen
-from factorbus.client.imu import ImuNoise, Moments, checked_samples
+from factorbus.client.imu import STANDARD_GRAVITY, ImuNoise, Moments, checked_samples
+from factorbus.client.imu_samples import warn_implausible
 from factorbus.proto.arrays import F64
 from factorbus.proto.inertial import BIAS, RESIDUAL
 from factorbus.proto.problems import BadInformation, BadOption, BadShape
@@ -95,9 +96,10 @@ def preintegrate_samples(samples: ArrayLike, noise: ImuNoise, bias: ArrayLike = 
     """The samples (n, 7) of `cut_samples` as one measurement, integrated at `bias`, the best guess of it.
 
     Good while the bias stays near that: the map corrects what was integrated to first order.
-    Raises BadShape, BadOption, NotFiniteNumbers.
+    ImplausibleSamples warns as of `Draft.imu`.  Raises BadShape, BadOption, NotFiniteNumbers.
     """
     rows, sensor = checked_samples("samples", samples), of_type("noise", noise, ImuNoise, "an ImuNoise")
+    warn_implausible(rows, np.array([0.0, 0.0, -STANDARD_GRAVITY]), stacklevel=3)
     b = checked_row("bias", bias, BIAS)
     R, p, v, S = np.eye(3), np.zeros(3), np.zeros(3), np.zeros((9, 9))
     R_b, p_b, v_b = np.zeros((3, 3)), np.zeros((3, 6)), np.zeros((3, 6))

@@ -3,13 +3,14 @@
 `asking_codec` and `repair_codec` turn them into bytes and back, `proto/README.md` §16 and §17 explain them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Factors, Variables
-from factorbus.proto.problems import NotHeld
+from factorbus.proto.problems import BadSymbol, NotHeld
 from factorbus.proto.symbols import format_symbol, parse_symbol
 from factorbus.proto.why_text import why_symbols, why_text
 
@@ -61,11 +62,24 @@ class Covariances:
 
     def __getitem__(self, key: int | str) -> F64:
         """The covariance (d, d) of one variable, such as "x12", of a diagonal.  Raises NotHeld, a KeyError."""
-        key = parse_symbol(key) if isinstance(key, str) else key
+        try:
+            key = parse_symbol(key) if isinstance(key, str) else key
+        except BadSymbol as bad:
+            raise NotHeld(bad.message) from None
         for group in self.groups:
             if group.keys.ndim == 1 and (rows := (group.keys == key).nonzero()[0]).size:
                 return group.covariance[rows[0]]
         raise NotHeld(f"the answer has no covariance of {format_symbol(key)}; ask for it by its key")
+
+    def __contains__(self, key: int | str) -> bool:
+        with suppress(KeyError):
+            return self[key] is not None
+        return False
+
+    def __iter__(self) -> Iterator[str]:
+        """The keys of a diagonal, such as "x12", in the order of the groups."""
+        single = (group.keys for group in self.groups if group.keys.ndim == 1)
+        return (format_symbol(key) for keys in single for key in keys.tolist())
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@
     │       ├── UnknownKind  unknown_kind         a kind of variable, factor or change that this version does not know
     │       ├── BadLoss      bad_loss             a loss that does not exist, a scale that is not positive
     │       └── BadOption    bad_option           a parameter whose value, or type, is not one it takes
+    ├── BadExpression        unknown_kind         a formula, or a function for one, that is no kind (`expressions`)
     ├── TooLarge             too_large            a message, an insert or a map over its limit
     ├── BadSequence          bad_sequence         a sequence number that skips or is too old to answer again
     ├── WrongEpoch           wrong_epoch          the map was restarted or recreated since the client joined
@@ -54,6 +55,7 @@ class Problem(Picklable, Exception):
     """Base of everything that is answered instead of an answer."""
 
     code = "problem"
+    others: "tuple[Problem, ...]" = ()  # of several that came at once, those after the one that is raised
 
     def __init__(self, message: str, **detail: Any) -> None:
         self.detail: dict[str, Any] = detail

@@ -143,10 +143,9 @@ class BadShape(SolverError):
 class DuplicateVariable(SolverError):
     code = "duplicate_variable"
 
-    def __init__(self, key: int) -> None:
-        super().__init__(
-            f"variable {printed(key)} exists already; take another key, or leave it out if it is meant", key=key
-        )
+    def __init__(self, key: int, twice: bool = False) -> None:
+        seen = "comes twice in one insert" if twice else "exists already"
+        super().__init__(f"variable {printed(key)} {seen}; take another key, or leave it out if it is meant", key=key)
 
 
 class UnknownVariable(SolverError):
@@ -377,10 +376,12 @@ class BadWeight(SolverError):
 class Uninitialized(SolverError):
     code = "uninitialized"
 
-    def __init__(self, key: int) -> None:
+    def __init__(self, key: int, factors: Sequence[str] = ()) -> None:
+        listed = ", ".join(factors[:4]) + (", ..." if len(factors) > 4 else "")
+        why = f"what is on it in its batch, {listed}, gives it none" if factors else "no factor of its batch is on it"
         super().__init__(
-            f"variable {printed(key)} has no value and no factor of its batch reaches it from one that has; give it a "
-            "value, or a factor that leads to it",
+            f"variable {printed(key)} has no value and {why}; give it a value, or a factor that leads to it from a "
+            "variable with one",
             key=key,
         )
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from factorbus.cli.logs.sensor_log import NO_TURN, Fixes, Imu, SensorLog, Way
 from factorbus.cli.logs.table import sensor_settings, timed
-from factorbus.client.geodetic import enu
+from factorbus.client.geodetic import MOST_LONGITUDE, enu
 from factorbus.client.imu import ImuNoise
 from factorbus.formats import FormatError
 from factorbus.proto.arrays import F64, I64
@@ -76,12 +76,15 @@ def _fixes(folder: Path, notes: list[str]) -> Fixes | None:
     has_sigmas = first.count(",") >= 6
     what = "latitude, longitude, height" + (", sigmas east, north, up" if has_sigmas else "")
     times, rows = timed(file, 6 if has_sigmas else 3, what)
-    wrong = np.flatnonzero((np.abs(rows[:, 0]) > 90) | (rows[:, 3:] <= 0).any(axis=1))
+    off = (np.abs(rows[:, :2]) > [90.0, MOST_LONGITUDE]).any(axis=1)
+    wrong = np.flatnonzero(off | (rows[:, 3:] <= 0).any(axis=1))
     if wrong.size:
-        found = f"the {wrong[0] + 1}. fix: latitude {rows[wrong[0], 0]:g}, sigmas {rows[wrong[0], 3:].tolist()}"
-        raise FormatError(str(file), None, found, "latitudes of -90 to 90 degrees and sigmas above 0")
+        latitude, longitude, _, *sigmas = rows[wrong[0]].tolist()
+        found = f"the {wrong[0] + 1}. fix: latitude {latitude:g}, longitude {longitude:g}, sigmas {sigmas}"
+        wanted = f"latitudes of -90 to 90 and longitudes of -{MOST_LONGITUDE:g} to {MOST_LONGITUDE:g} degrees"
+        raise FormatError(str(file), None, found, f"{wanted}, and sigmas above 0")
     origin = sensor_settings(folder / "sensor.yaml", {"origin"}).get("origin", rows[0, :3])
-    if origin.size != 3 or abs(origin[0]) > 90:
+    if origin.size != 3 or (np.abs(origin[:2]) > [90.0, MOST_LONGITUDE]).any():
         found = f"origin {origin.tolist()}"
         raise FormatError(str(folder / "sensor.yaml"), None, found, "latitude, longitude (degrees), height (metres)")
     places = np.array([enu(row[:3], origin) for row in rows])

@@ -11,7 +11,7 @@ import numpy as np
 
 from factorbus.cli.logs.sensor_log import Fixes, Imu, SensorLog
 from factorbus.cli.logs.table import in_order, rows_of_numbers, stamp_of_date, text_of
-from factorbus.client.geodetic import enu
+from factorbus.client.geodetic import MOST_LONGITUDE, enu
 from factorbus.client.imu import ImuNoise
 from factorbus.formats import FormatError
 from factorbus.proto.arrays import I64
@@ -35,10 +35,11 @@ def read_oxts(folder: Path) -> SensorLog:
         found = f"{len(files)} packets in {folder / 'data'} for {len(times)} times"
         raise FormatError(str(stamps), None, found, "a packet a time, and at least one")
     packets = np.array([rows_of_numbers(file, _ACCURACY + 1, _PACKET, None)[0][0] for file in files])
-    wrong = np.flatnonzero(np.abs(packets[:, 0]) > 90)
+    wrong = np.flatnonzero((np.abs(packets[:, :2]) > [90.0, MOST_LONGITUDE]).any(axis=1))
     if wrong.size:
-        found = f"latitude {packets[wrong[0], 0]:g}"
-        raise FormatError(str(files[wrong[0]]), 1, found, "-90 to 90 degrees")
+        found = "latitude {:g}, longitude {:g}".format(*packets[wrong[0], :2])
+        wanted = f"-90 to 90 degrees, and -{MOST_LONGITUDE:g} to {MOST_LONGITUDE:g}"
+        raise FormatError(str(files[wrong[0]]), 1, found, wanted)
     places = np.array([enu(row[:3], packets[0, :3]) for row in packets])
     sigmas = np.maximum(packets[:, _ACCURACY, None], 0.01) * [1.0, 1.0, 2.0]
     rates = np.column_stack([packets[:, _TURN], packets[:, _ACCELERATION]])

@@ -21,6 +21,7 @@ from factorbus.proto.expressions.operations import (
     value_size,
 )
 from factorbus.proto.nearest import nearest
+from factorbus.proto.problems import Problem
 from factorbus.proto.variable_kinds import VARIABLE_KINDS
 from factorbus.wording import counted
 
@@ -33,8 +34,10 @@ PARAMETER = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _NAMES = "up to {} small letters, digits and _, a letter first"
 
 
-class BadExpression(ValueError):
+class BadExpression(Problem, ValueError):
     """There is no such factor kind, and why."""
+
+    code = "unknown_kind"
 
 
 @dataclass(frozen=True)

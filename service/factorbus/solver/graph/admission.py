@@ -66,6 +66,8 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns) -> int:
             graph.make_room(groups)
             fault, g, row, rest = admit_groups(raw, groups, graph.array_table)
         if g >= 0:
+            if fault == gt.DUPLICATE:
+                raise _duplicate(graph, raw, groups[g], row, mark[at.VARIABLES])
             raise _find_bad_row(graph, raw, groups[g], row, fault)
         if problem is not None:
             raise problem
@@ -104,7 +106,7 @@ def _compose(graph: FactorGraph, first: int, first_factor: int, reached: I64) ->
     if missing >= 0 and place_by_bearings(graph, first, first_factor, reached):
         missing = _find_missing(graph, first, first_factor, reached)
     if missing >= 0:
-        raise errors.Uninitialized(int(graph.keys[missing]))
+        raise errors.Uninitialized(int(graph.keys[missing]), graph.factors_of(missing))
     outside = find_first_outside(first, int(graph.counts[at.VARIABLES]), graph.var, graph.values)
     if outside >= 0:
         raise value_out_of_bounds(graph, outside)
@@ -128,6 +130,12 @@ def out_of_bounds(where: str, numbers: F64, most: float = MOST_NUMBER, advice: s
 def _find_missing(graph: FactorGraph, first: int, first_factor: int, reached: I64) -> int:
     """Compose values for those that are not `reached` yet; gives one that nothing leads to, or −1."""
     return int(reach(True, first, first_factor, int(graph.counts[at.FACTORS]), graph.array_table, reached))
+
+
+def _duplicate(graph: FactorGraph, raw: bytes, group: I64, n: int, first: int) -> errors.SolverError:
+    """The n-th variable of a group is there already: in the map, or since `first` in what is being admitted."""
+    key = int(ints_at(raw, int(group[gt.G_KEYS]) + 8 * n, 1)[0])
+    return errors.DuplicateVariable(key, graph.find(key) >= first)
 
 
 def _find_bad_row(graph: FactorGraph, raw: bytes, group: I64, n: int, fault: int) -> errors.SolverError:
@@ -163,8 +171,6 @@ def _kind_of(graph: FactorGraph, raw: bytes, group: I64) -> FactorKind:
 
 def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.SolverError:
     where = f"{kind} {errors.printed(key)}"
-    if wrong == gt.DUPLICATE:
-        return errors.DuplicateVariable(key)
     if wrong == gt.BAD_QUATERNION and value is not None:
         at_q = wire.VARIABLE_KINDS[kind].quaternion_at
         return errors.BadQuaternion(where, float(np.linalg.norm(value[at_q : at_q + 4])))
