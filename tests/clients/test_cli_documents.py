@@ -90,3 +90,9 @@ def test_what_json_has_no_word_for_is_null(capsys: pytest.CaptureFixture[str]) -
     assert report(Stopped("made_up", "of the test", **detail), as_json=True, debug=False) == FAILED
     said = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
     assert said["problem"]["detail"] == {"seen": None, "row": [1.0, None], "of": "x"}
+
+
+def test_a_range_of_numbers_is_called_a_number_where_something_else_is_given() -> None:
+    kinds = {(words, each.name): each.type for words, command in ALL.items() for each in command.params}
+    plain = [where for where, kind in kinds.items() if kind.name in ("integer range", "float range")]
+    assert plain == [], "use WholeNumber or Number of factorbus.cli.process.options"

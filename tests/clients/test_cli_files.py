@@ -49,13 +49,24 @@ def test_convert_says_what_it_leaves_out(folder: Path, capsys: pytest.CaptureFix
     assert main(["convert", "a.g2o", "b.g2o", "--json"]) == OK
     shown = capsys.readouterr()
     assert "a.g2o: 2 ROBOTLASER1 left out: " in shown.err
-    assert "a.g2o: 1 vertex that a replay leaves out: no edge names 9" in shown.err
+    assert "a.g2o: 1 vertex that replay and solve leave out: no edge names 9" in shown.err
     told = json.loads(shown.out)
     assert "b.g2o: 5 poses, 0 landmarks, 4 factors" in shown.err
     assert told["read"]["left_out"] == {"ROBOTLASER1": 2}
     assert "VERTEX_SE2 9 0 0 0" in (folder / "b.g2o").read_text()
     assert told["read"]["notes"] == [line[7:] for line in shown.err.splitlines() if line.startswith("a.g2o: ")]
     assert (told["files"], told["poses"], told["factors"]) == (["b.g2o"], 5, 4)
+
+
+def test_convert_counts_what_is_in_the_file_that_it_wrote(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seen = f"VERTEX_XY 5 1 1\nEDGE_SE2_XY 0 5 1 1 1 0 1\nEDGE_SE2_XY 1 5 0 1 1 0 1\nEDGE_SE2 0 1 1 0 0 {INFO3}\n"
+    (folder / "a.g2o").write_text(f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n{seen}")
+    assert main(["convert", "a.g2o", "b.jrl", "--json"]) == OK
+    shown = capsys.readouterr()
+    assert "b.jrl: 2 landmark_se2 left out: " in shown.err
+    assert "b.jrl: 2 poses, 1 landmark, 1 factor" in shown.err
+    told = json.loads(shown.out)
+    assert (told["poses"], told["landmarks"], told["factors"]) == (2, 1, 1)
 
 
 def test_a_trajectory_is_converted_with_its_times(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

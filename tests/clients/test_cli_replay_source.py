@@ -87,3 +87,11 @@ def test_replay_by_name(
     assert (result["poses"], result["file"]) == (2, str(tmp_path / "own" / "intel.g2o"))
     assert main(["replay", "intle", "--in-process"]) == BAD_FILE
     assert "no data set of that name" in capsys.readouterr().err
+
+
+def test_a_plot_of_what_is_no_file_says_how_a_map_on_the_bus_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["plot", "sparsity", "warehouse"]) == BAD_FILE
+    assert "the name of a map on the bus, with --connect" in capsys.readouterr().err

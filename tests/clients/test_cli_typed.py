@@ -56,6 +56,12 @@ def test_pictures_are_those_that_can_be_drawn() -> None:
         (["change", "weigh", "m", "-1", "3", *NOWHERE], "A number below 0 is written behind `--`"),
         (["change", "loss", "m", "foo", "1", "3", *NOWHERE], "changes: the loss 'foo'; wanted none, or one of huber"),
         (["change", "loss", "m", "dcs", "0", "3", *NOWHERE], "changes: the scale 0.0; wanted finite numbers above 0"),
+        (
+            ["change", "loss", "m", "dcs:2", "3", *NOWHERE],
+            "'dcs:2' is a name and a scale; here they are two words: dcs 2",
+        ),
+        (["ask", "chi2", "m", "--timeout", "soon", *NOWHERE], "'soon' is not a valid number."),
+        (["solve", "a.g2o", "--max-iterations", "1.5"], "'1.5' is not a valid integer."),
         (["ros2", "m", "--tolerance", "nan", *NOWHERE], "'nan' is not a finite number"),
         (["ros2", "m", "--display", "-1", *NOWHERE], "-1.0 is not in the range"),
         (["bench"], "Missing argument"),

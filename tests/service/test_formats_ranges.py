@@ -89,7 +89,7 @@ def test_too_few_ranges_leave_a_point_out_of_the_replay_and_in_the_graph(tmp_pat
     lines = [*drive("A", BEND), "VERTEX_XY L0 6 0", "VERTEX_XY L1 6 1", "EDGE_RANGE 0 A0 L0 6 1"]
     graph = read_text(tmp_path, lines)
     assert graph.left_out == {"vertices": 1, "points": 1}
-    assert graph.notes[1] == "1 point that a replay leaves out: so few ranges do not place L0"
+    assert graph.notes[1] == "1 point that replay and solve leave out: so few ranges do not place L0"
     assert graph.landmarks == 2
     assert set(entries(graph)) == {f"A{k}" for k in range(6)}
     assert solved(graph).variable_count == 6

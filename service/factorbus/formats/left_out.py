@@ -77,7 +77,7 @@ class LeftOut:
             raise self._refused(count, name, why)
         if count:
             self.counts[name] = self.counts.get(name, 0) + count
-            self.notes.append(f"{_counted(count, name)} that a replay leaves out: {why}")
+            self.notes.append(f"{_counted(count, name)} that replay and solve leave out: {why}")
 
     def change(self, name: str, count: int, into: str, why: str) -> None:
         """Note what stays in the file, but says less there: written as `into`.  Raises FormatError when strict."""

@@ -65,9 +65,17 @@ def remove_command(address: MapAddress, what: tuple[str, ...], alone: bool, **ho
     return _make(address, changes, **how)
 
 
+def _name_alone(_context: click.Context, _param: click.Parameter, loss: str) -> str:
+    """The name of a loss: `--loss` of other commands takes it with its scale, as huber:1.0."""
+    name, colon, scale = loss.partition(":")
+    if colon:
+        raise click.BadParameter(f"{loss!r} is a name and a scale; here they are two words: {name} {scale or 1.0}")
+    return loss
+
+
 @command.command("loss")
 @_changing
-@click.argument("loss")
+@click.argument("loss", callback=_name_alone)
 @click.argument("scale", type=Number())
 @click.argument("factors", nargs=-1, required=True, type=int)
 def loss_command(address: MapAddress, loss: str, scale: float, factors: tuple[int, ...], **how: Any) -> int:

@@ -138,6 +138,18 @@ def _check_any(graph: "GraphFile", target: Path) -> None:
         raise FormatError(graph.path, None, f"no pose, and a {target.suffix} has nothing else", "at least one pose")
 
 
+def _without_left_out(counts: dict[str, int], notes: "FileNotes", graph: "GraphFile") -> dict[str, int]:
+    """How much of `counts`, which are of the graph, is in a file that was written without what its notes count."""
+    from factorbus.proto.kinds import name_of_kind
+
+    of_kind = {
+        "poses": {"se2", "se3", "mounts", "frames"},
+        "landmarks": {"point2", "point3", "idp"},
+        "factors": {name_of_kind(group.kind) for group in graph.batch.factors},
+    }
+    return {many: counts[many] - sum(notes.counts.get(name, 0) for name in of_kind[many]) for many in counts}
+
+
 def _written(
     graph: "GraphFile", target: Path, strict: bool, robot: str | None, ids: str
 ) -> tuple[list[Path], "FileNotes", dict[str, int]]:
@@ -150,7 +162,7 @@ def _written(
     if target.suffix in GRAPHS:
         same = graph.numbering if graph.numbering != "ids" else "auto"
         notes = write_graph(target, graph.batch, strict, same if ids == "auto" else ids, graph.log)
-        return [target], notes, counts
+        return [target], notes, _without_left_out(counts, notes, graph)
     form = target.suffix[1:].upper()
     found = trajectories(graph.batch, form)
     chosen = [one_trajectory(graph.batch, form, robot)] if robot is not None else list(found.values())

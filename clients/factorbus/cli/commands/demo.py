@@ -12,7 +12,7 @@ import click
 
 from factorbus.cli.output.exits import output_file, require
 from factorbus.cli.output.starts import NOT_CONVERGED, optimum_from
-from factorbus.cli.process.options import WORLDS, json_option, out_option
+from factorbus.cli.process.options import WORLDS, WholeNumber, json_option, out_option
 from factorbus.wording import counted
 
 _COMPARISONS = 10
@@ -46,9 +46,9 @@ class _Demos(click.Group):
 
 @click.group(cls=_Demos, invoke_without_command=True)
 @click.option("--world", type=click.Choice(WORLDS), default="manhattan", show_default=True)
-@click.option("--poses", type=click.IntRange(10, 1_000_000), default=2000, show_default=True, metavar="N")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
-@click.option("--workers", type=click.IntRange(0, 64), default=2, show_default=True, metavar="N")
+@click.option("--poses", type=WholeNumber(10, 1_000_000), default=2000, show_default=True, metavar="N")
+@click.option("--seed", type=WholeNumber(0), default=1, show_default=True, help="The same seed, the same world.")
+@click.option("--workers", type=WholeNumber(0, 64), default=2, show_default=True, metavar="N")
 @out_option("--plot", "plot", "The picture.  [default: out/demo.png]", "FILE.png")
 @out_option("--tum", "tum", "Write the estimated trajectory in TUM form.", "FILE")
 @out_option("--truth", "truth", "Write where the robot really was, in TUM form.", "FILE")

@@ -7,18 +7,18 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import output_file, require
-from factorbus.cli.process.options import Number, json_option, out_option
+from factorbus.cli.process.options import Number, WholeNumber, json_option, out_option
 from factorbus.wording import counted
 
 _RHO, _SIGMA_RHO = 0.28, 0.2  # 1/metre: anything from 1.5 metres to behind the horizon
 
 
 @click.command()
-@click.option("--frames", type=click.IntRange(2, 100_000), default=200, show_default=True, metavar="N")
-@click.option("--points", type=click.IntRange(20, 100_000), default=300, show_default=True, metavar="N")
+@click.option("--frames", type=WholeNumber(2, 100_000), default=200, show_default=True, metavar="N")
+@click.option("--points", type=WholeNumber(20, 100_000), default=300, show_default=True, metavar="N")
 @click.option(
     "--features",
-    type=click.IntRange(8, 500),
+    type=WholeNumber(8, 500),
     default=60,
     show_default=True,
     metavar="N",
@@ -26,8 +26,8 @@ _RHO, _SIGMA_RHO = 0.28, 0.2  # 1/metre: anything from 1.5 metres to behind the 
 )
 @click.option("--noise", type=Number(0.01, 20.0), default=1.0, show_default=True, metavar="PIXELS")
 @click.option("--outliers", type=Number(0.0, 0.5), default=0.05, show_default=True, metavar="SHARE")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
-@click.option("--workers", type=click.IntRange(0, 64), default=2, show_default=True, metavar="N")
+@click.option("--seed", type=WholeNumber(0), default=1, show_default=True, help="The same seed, the same world.")
+@click.option("--workers", type=WholeNumber(0, 64), default=2, show_default=True, metavar="N")
 @out_option("--plot", "plot", "The picture.  [default: out/monocular.png]", "FILE.png")
 @json_option
 def command(as_json: bool, plot: Path | None, **asked: Any) -> None:

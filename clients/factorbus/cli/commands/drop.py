@@ -2,14 +2,14 @@
 
 import click
 
-from factorbus.cli.process.options import connect_option, json_option, timeout_option, zenoh_option
+from factorbus.cli.process.options import WholeNumber, connect_option, json_option, timeout_option, zenoh_option
 
 
 @click.command()
 @click.argument("name", metavar="MAP")
 @click.option(
     "--revision",
-    type=click.IntRange(0),
+    type=WholeNumber(0),
     metavar="N",
     help="Only if the map is at this revision and nothing is under way: what `factorbus export` said.",
 )

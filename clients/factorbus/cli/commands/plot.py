@@ -9,7 +9,14 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.output.exits import output_file, require
-from factorbus.cli.process.options import ellipses_option, json_option, mode_option, out_option, zenoh_option
+from factorbus.cli.process.options import (
+    WholeNumber,
+    ellipses_option,
+    json_option,
+    mode_option,
+    out_option,
+    zenoh_option,
+)
 from factorbus.cli.process.reading import reading_options
 from factorbus.wording import counted
 
@@ -117,7 +124,7 @@ def map_command(
 @mode_option
 @click.option(
     "--every",
-    type=click.IntRange(0),
+    type=WholeNumber(0),
     metavar="N",
     help="Solve from scratch at every Nth step, to hold χ² against.  [default: ten times]",
 )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from factorbus.cli.output.exits import require
-from factorbus.cli.process.options import Number, connect_option, out_option, zenoh_option
+from factorbus.cli.process.options import Number, WholeNumber, connect_option, out_option, zenoh_option
 from factorbus.wording import counted
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 @click.option(
     "--no-deltas", is_flag=True, help="Only what is drawn and plotted, not every estimate and factor as numbers."
 )
-@click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
+@click.option("--until", type=WholeNumber(1), metavar="REVISION", help="Stop when the map has got there.")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
 def command(
     map_name: str,

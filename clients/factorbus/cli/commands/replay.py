@@ -18,6 +18,7 @@ from factorbus.cli.output.starts import optimum_from
 from factorbus.cli.process.options import (
     SECONDS,
     Number,
+    WholeNumber,
     file_argument,
     grouped,
     json_option,
@@ -110,12 +111,12 @@ class RecordingCommand(NodeCommand):
 )
 @click.option(
     "--every",
-    type=click.IntRange(0),
+    type=WholeNumber(0),
     default=0,
     metavar="N",
     help="Hold χ² against the batch optimum at every Nth step; 0: never.",
 )
-@click.option("--window", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Inserts in flight.")
+@click.option("--window", type=WholeNumber(1), default=1, show_default=True, metavar="N", help="Inserts in flight.")
 @click.option("--use-values", is_flag=True, help="Start from the file's vertex values, not from composed odometry.")
 @click.option("--settle/--no-settle", default=True, show_default=True, help="At the end, iterate until converged.")
 @click.option(
@@ -126,7 +127,7 @@ class RecordingCommand(NodeCommand):
 )
 @click.option("--live", is_flag=True, help="Show the map in a browser as it grows; afterwards stay until Ctrl-C.")
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Of the page with --live; 0: any."
+    "--port", type=WholeNumber(0, 65535), default=8080, show_default=True, help="Of the page with --live; 0: any."
 )
 @click.option("--pace", type=Number(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
 @click.option(

@@ -2,12 +2,14 @@
 
 import click
 
+from factorbus.cli.process.options import WholeNumber
+
 
 @click.command(hidden=True)
 @click.option("--connect", "endpoint", required=True, metavar="ENDPOINT")
 @click.option("--map", "map_name", required=True, metavar="NAME")
 @click.option("--world", required=True)
-@click.option("--poses", type=click.IntRange(2), required=True)
+@click.option("--poses", type=WholeNumber(2), required=True)
 @click.option("--seed", type=int, required=True)
 @click.option("--until-eof", is_flag=True)
 def command(endpoint: str, map_name: str, world: str, poses: int, seed: int, until_eof: bool) -> None:

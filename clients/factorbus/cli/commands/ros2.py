@@ -11,7 +11,7 @@ import click
 from factorbus.cli.output.exits import require
 from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.options import DEFAULT_ENDPOINT, SECONDS, grouped, zenoh_option
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, SECONDS, WholeNumber, grouped, zenoh_option
 from factorbus.cli.process.parameters_file import NodeCommand, params_file_option
 from factorbus.cli.process.robot_options import robot_options
 from factorbus.ros2.options import BridgeOptions
@@ -44,7 +44,7 @@ class NodeOptions:
 @click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="Ours.")
 @click.option("--ros", metavar="ENDPOINT", help="The robot's Zenoh router (rmw_zenohd).  [default: as --connect]")
 @click.option(
-    "--domain", type=click.IntRange(0, 232), default=0, show_default=True, envvar="ROS_DOMAIN_ID", show_envvar=True
+    "--domain", type=WholeNumber(0, 232), default=0, show_default=True, envvar="ROS_DOMAIN_ID", show_envvar=True
 )
 @click.option("--distro", type=click.Choice(DISTRIBUTIONS), default="jazzy", show_default=True, help="Of the robot.")
 @click.option("--namespace", default="/", show_default=True, metavar="NAME", help="Of our node; topics are as given.")

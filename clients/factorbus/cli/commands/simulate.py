@@ -7,14 +7,14 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import output_file
-from factorbus.cli.process.options import WORLDS, json_option, out_option
+from factorbus.cli.process.options import WORLDS, WholeNumber, json_option, out_option
 from factorbus.wording import counted
 
 
 @click.command()
 @click.argument("world", type=click.Choice((*WORLDS, "inertial")))
-@click.option("--poses", type=click.IntRange(2, 1_000_000), default=3500, show_default=True, metavar="N")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
+@click.option("--poses", type=WholeNumber(2, 1_000_000), default=3500, show_default=True, metavar="N")
+@click.option("--seed", type=WholeNumber(0), default=1, show_default=True, help="The same seed, the same world.")
 @out_option("--out", "out", "What the robot measured; a .jrl has the truth as well.", "FILE.g2o|.pyfg|.jrl|.cbor")
 @click.option(
     "--folder",

@@ -8,7 +8,15 @@ from click.core import ParameterSource
 
 from factorbus.cli.driving.solving import SolveRequest
 from factorbus.cli.output.exits import FAILED, OK, require
-from factorbus.cli.process.options import Number, checked_output, file_argument, grouped, json_option, out_option
+from factorbus.cli.process.options import (
+    Number,
+    WholeNumber,
+    checked_output,
+    file_argument,
+    grouped,
+    json_option,
+    out_option,
+)
 from factorbus.cli.process.reading import reading_options
 from factorbus.proto.kinds import LOSSES
 from factorbus.proto.problems import BadSymbol
@@ -81,8 +89,8 @@ def _covariance(ctx: click.Context, parameter: click.Parameter, text: str | None
     help="Covariance of x5,l3,... at the optimum; or of all variables, into a file. Rows are in the order of "
     "`factorbus ask covariance`: x y theta, or x y z rx ry rz (m, rad).",
 )
-@click.option("--max-iterations", type=click.IntRange(1), default=500, show_default=True, help="Of one start.")
-@click.option("--cores", type=click.IntRange(1), metavar="N", help="Use N of them.  [default: all there are]")
+@click.option("--max-iterations", type=WholeNumber(1), default=500, show_default=True, help="Of one start.")
+@click.option("--cores", type=WholeNumber(1), metavar="N", help="Use N of them.  [default: all there are]")
 @reading_options
 @json_option
 def command(request: SolveRequest, as_json: bool) -> int:

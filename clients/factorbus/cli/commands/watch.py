@@ -14,6 +14,7 @@ from factorbus.cli.process.bind_address import insecure_option, refuse_open_page
 from factorbus.cli.process.interest_options import PartOptions, part_options
 from factorbus.cli.process.options import (
     Number,
+    WholeNumber,
     connect_option,
     ellipses_option,
     grouped,
@@ -58,13 +59,13 @@ class UntilOptions:
 @click.option(
     "--host", default="127.0.0.1", show_default=True, help="Address to serve it at, as browsers reach it; 0.0.0.0: all."
 )
-@click.option("--web-port", type=click.IntRange(1, 65535), default=9090, show_default=True, metavar="PORT")
-@click.option("--data-port", type=click.IntRange(1, 65535), default=9876, show_default=True, metavar="PORT")
+@click.option("--web-port", type=WholeNumber(1, 65535), default=9090, show_default=True, metavar="PORT")
+@click.option("--data-port", type=WholeNumber(1, 65535), default=9876, show_default=True, metavar="PORT")
 @insecure_option
 @click.option("--rate", type=Number(0.1, 60), default=5.0, show_default=True, metavar="HZ", help="Looks a second.")
 @ellipses_option(30)
 @part_options
-@click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
+@click.option("--until", type=WholeNumber(1), metavar="REVISION", help="Stop when the map has got there.")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
 def command(
     map_name: str,

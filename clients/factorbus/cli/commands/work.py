@@ -8,14 +8,14 @@ from factorbus.cli.output.exits import require
 from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
 from factorbus.cli.process.notify import Notifier
-from factorbus.cli.process.options import DEFAULT_ENDPOINT
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, WholeNumber
 
 
 @click.command()
 @click.option(
     "--connect", multiple=True, metavar="ENDPOINT", help=f"A service, or a router.  [default: {DEFAULT_ENDPOINT}]"
 )
-@click.option("--slots", type=click.IntRange(1, 1024), default=1, show_default=True, help="Jobs at a time.")
+@click.option("--slots", type=WholeNumber(1, 1024), default=1, show_default=True, help="Jobs at a time.")
 @click.option("--name", default="", metavar="NAME", help="As the bus sees it.  [default: made up]")
 @click.option("--zenoh", default="", metavar="FILE.json5", help="Zenoh configuration: TLS, access control.")
 @click.option("--warm/--no-warm", default=True, help="Compile every kernel before the first job.  [default: warm]")

@@ -49,7 +49,8 @@ def file_named(source: str, dialect: str | None = None, strict: bool = False) ->
     from factorbus.cli.driving.replay_source import source_of
     from factorbus.cli.process.reading import read_graph
 
-    return read_graph(source_of(Path(source)), dialect, strict)
+    file = source_of(Path(source), else_="; or the name of a map on the bus, with --connect tcp/127.0.0.1:7447, say")
+    return read_graph(file, dialect, strict)
 
 
 def with_values(drawn: Drawn) -> Drawn:

@@ -8,11 +8,13 @@ from factorbus.cli.output.exits import BAD_FILE, Stopped
 from factorbus.datasets import CATALOGUE, Dataset, DatasetProblem, Places, find
 
 
-def source_of(given: Path, places: Places | None = None, catalogue: Sequence[Dataset] = CATALOGUE) -> Path:
+def source_of(
+    given: Path, places: Places | None = None, catalogue: Sequence[Dataset] = CATALOGUE, else_: str = ""
+) -> Path:
     """The file to read for what the command line gave.
 
     A file that is there is taken as it is; so is every path that cannot be a data set's name, for who reads it says
-    best what is wrong with it.  Raises Stopped.
+    best what is wrong with it.  else_: what the command takes beside these.  Raises Stopped.
     """
     known = {word for dataset in catalogue for word in (dataset.name, dataset.file)}
     if given.exists() or (str(given) not in known and (given.suffix or given.name != str(given))):
@@ -22,7 +24,7 @@ def source_of(given: Path, places: Places | None = None, catalogue: Sequence[Dat
             "bad_file",
             f"{given}: no such file, and no data set of that name; wanted a g2o, TORO, iSAM, SLAM++, "
             f"PyFactorGraph or JRL file, a map of GLIM's, a recording (.mcap, .bag, rosbag2), "
-            f"or one of {', '.join(dataset.name for dataset in catalogue)}",
+            f"or one of {', '.join(dataset.name for dataset in catalogue)}{else_}",
             BAD_FILE,
             path=str(given),
         )

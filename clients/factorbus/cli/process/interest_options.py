@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from factorbus.cli.process.options import WholeNumber
+
 if TYPE_CHECKING:
     from factorbus.proto.interest import Interest
 
@@ -65,11 +67,11 @@ _OPTIONS = (
         "--box", default="", metavar="X,Y,X,Y", help="Variables in this box: the lowest x,y or x,y,z, then the highest."
     ),
     click.option(
-        "--period-ms", type=click.IntRange(10, 60_000), metavar="MS", help="Merge changes for so long.  [default: 100]"
+        "--period-ms", type=WholeNumber(10, 60_000), metavar="MS", help="Merge changes for so long.  [default: 100]"
     ),
     click.option(
         "--bytes-per-s",
-        type=click.IntRange(1000),
+        type=WholeNumber(1000),
         metavar="N",
         help="Let the link carry this at most, newest poses first.",
     ),

@@ -59,8 +59,16 @@ def mode_option(command: F) -> F:
     )(command)
 
 
+class WholeNumber(click.IntRange):
+    """A whole number in a range; of what is none click's own says that it is no valid integer range."""
+
+    name = "integer"
+
+
 class Number(click.FloatRange):
-    """A finite number in a range: click's own lets NaN through."""
+    """A finite number in a range: click's own lets NaN through, and calls what is no number no valid float range."""
+
+    name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         number = super().convert(value, param, ctx)
@@ -172,7 +180,7 @@ def ellipses_option(count: int) -> Callable[[F], F]:
     """--ellipses."""
     return click.option(
         "--ellipses",
-        type=click.IntRange(0, 2000),
+        type=WholeNumber(0, 2000),
         default=count,
         show_default=True,
         metavar="N",
