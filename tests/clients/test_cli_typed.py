@@ -60,6 +60,10 @@ def test_pictures_are_those_that_can_be_drawn() -> None:
             ["change", "loss", "m", "dcs:2", "3", *NOWHERE],
             "'dcs:2' is a name and a scale; here they are two words: dcs 2",
         ),
+        (
+            ["change", "merge", "m", "n", "--anchor", "x0", "y0", "0,0", "--sigmas", "1,1,1", *NOWHERE],
+            "--anchor: 0,0 is 2 numbers; wanted x,y,theta or x,y,z,qx,qy,qz,qw",
+        ),
         (["ask", "chi2", "m", "--timeout", "soon", *NOWHERE], "'soon' is not a valid number."),
         (["solve", "a.g2o", "--max-iterations", "1.5"], "'1.5' is not a valid integer."),
         (["ros2", "m", "--tolerance", "nan", *NOWHERE], "'nan' is not a finite number"),

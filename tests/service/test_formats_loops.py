@@ -80,6 +80,16 @@ def test_what_is_no_closure_is_refused(way: Path, text: str, wanted: str, line: 
     assert refused.value.line == line
 
 
+def test_the_place_that_there_is_not_is_named_and_not_the_first_that_is_no_time(tmp_path: Path) -> None:
+    (tmp_path / "late.tum").write_text("1700000000.5 0 0 0 0 0 0 1\n1700000001.5 1 0 0 0 0 0 1\n")
+    graph = read(tmp_path / "late.tum")
+    with pytest.raises(FormatError, match="pose 99; wanted a place from 0 to 1, or within") as refused:
+        with_loops(graph, loops(tmp_path / "late.tum", "0 1 0 0 0 0 0 0 1\n0 99 0 0 0 0 0 0 1\n"))
+    assert refused.value.line == 2
+    with pytest.raises(FormatError, match=r"cannot be read .*; wanted lines of first second tx"):
+        with_loops(graph, tmp_path / "none.txt")
+
+
 def test_a_graph_takes_no_list(way: Path, tmp_path: Path) -> None:
     (tmp_path / "a.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     with pytest.raises(FormatError, match="wanted a trajectory"):

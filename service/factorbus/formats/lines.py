@@ -25,6 +25,7 @@ _OTHERWISE = {
     b"\xfe\xff": ("text in UTF-16", "iconv -f UTF-16 -t UTF-8"),
 }
 # Graphs are packed to a third or a twentieth.  A file of some kilobytes could else unpack to all the memory there is.
+_GRAPH = "a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file"
 _MOST_UNPACKED, _MOST_TIMES = 1 << 26, 200
 
 
@@ -75,8 +76,11 @@ def _uncommented(line: bytes) -> bytes:
     return line[: found.start()] if found else line
 
 
-def read_content(path: Path) -> bytes:
-    """The bytes of the file, unpacked where it is a gzip file, without a byte order mark.  Raises FormatError."""
+def read_content(path: Path, wanted: str = _GRAPH) -> bytes:
+    """The bytes of the file, unpacked where it is a gzip file, without a byte order mark.
+
+    wanted: what it should be, for the error.  Raises FormatError.
+    """
     try:
         if is_device(path):
             raise FormatError(str(path), None, "a device", "a file, or a pipe such as /dev/stdin behind one")
@@ -88,8 +92,7 @@ def read_content(path: Path) -> bytes:
         mend = "; " + mend_of(failure) if isinstance(failure, OSError) and failure.errno else ""
         if isinstance(failure, IsADirectoryError):
             mend += ", or the folder of a map that GLIM has saved, with graph.txt and submaps"
-        wanted = f"a readable g2o, TORO, iSAM, SLAM++, PyFactorGraph or JRL file{mend}"
-        raise FormatError(str(path), None, f"it cannot be read ({reason})", wanted) from failure
+        raise FormatError(str(path), None, f"it cannot be read ({reason})", f"{wanted}{mend}") from failure
     return content.removeprefix(b"\xef\xbb\xbf")
 
 

@@ -42,7 +42,7 @@ def with_loops(graph: GraphFile, path: Path) -> GraphFile:
         order = np.argsort(stamps, kind="stable")
         poses, stamps = poses[order], stamps[order]
         group = group._replace(keys=group.keys[order], values=poses, stamps=stamps)
-    lines, ends, measured, sigmas = _closures(str(path), read_content(path), stamps, len(poses))
+    lines, ends, measured, sigmas = _closures(str(path), read_content(path, f"lines of {_FIELDS}"), stamps, len(poses))
     steps = np.arange(len(poses) - 1)
     odometry = compose_poses(inverse_poses(poses[:-1]), poses[1:])
     keys = np.concatenate([np.stack([steps, steps + 1], axis=1), ends])
@@ -82,8 +82,7 @@ def _closures(file: str, content: bytes, stamps: I64 | None, count: int) -> tupl
         if len(words) not in (9, 11) or not all(map(is_time, words)):
             raise FormatError(file, line, f"{' '.join(words)[:60]!r}", _FIELDS)
     lines = np.array([line for line, _ in rows], np.int64)
-    by_place = all(name.isdigit() and int(name) < count for _, words in rows for name in words[:2])
-    ends = np.array([[_place(file, line, name, by_place, stamps, count) for name in words[:2]] for line, words in rows])
+    ends = np.array(_ends(file, rows, stamps, count))
     refuse_first(file, lines, ends[:, 0] == ends[:, 1], lambda row: "a pose and itself", "two poses")
     numbers = np.array([[float(each) for each in words[2:9]] for _, words in rows])
     given = np.array([[float(each) for each in words[9:]] or [CLOSURE_M, CLOSURE_RAD] for _, words in rows])
@@ -93,9 +92,26 @@ def _closures(file: str, content: bytes, stamps: I64 | None, count: int) -> tupl
     return lines, ends, normalized_poses(file, "a loop closure", lines, numbers), np.repeat(given, 3, axis=1)
 
 
-def _place(file: str, line: int, name: str, by_place: bool, stamps: I64 | None, count: int) -> int:
-    if by_place:
-        return int(name)
+def _ends(file: str, rows: list[tuple[int, list[str]]], stamps: I64 | None, count: int) -> list[list[int]]:
+    """The places of both ends, which all lines have, or times.  Raises FormatError, with the pose that is neither."""
+    named = [(line, name) for line, words in rows for name in words[:2]]
+    others = [(line, name) for line, name in named if not _is_place(name, count)]
+    if not others:
+        return [[int(name) for name in words[:2]] for _, words in rows]
+    try:
+        return [[_at_time(file, line, name, stamps, count) for name in words[:2]] for line, words in rows]
+    except FormatError:
+        # All are whole numbers: places are meant, and the first that is none is wrong, not the first that is no time.
+        if all(name.isdigit() for _, name in named):
+            _at_time(file, *others[0], stamps, count)
+        raise
+
+
+def _is_place(name: str, count: int) -> bool:
+    return name.isdigit() and int(name) < count
+
+
+def _at_time(file: str, line: int, name: str, stamps: I64 | None, count: int) -> int:
     if stamps is None or (stamps == NO_STAMP).any():
         raise FormatError(file, line, f"pose {name}", f"a place from 0 to {count - 1}: the trajectory has no times")
     time = nanoseconds(file, line, name)

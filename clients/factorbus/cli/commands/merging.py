@@ -147,13 +147,10 @@ def read_candidates(file: Path, sigmas: str | None) -> Any:
                 f"{where} has {counted(len(fields), 'field')}; wanted POSE OTHERS Z [SIGMAS]: x5 y8 0,2,-1.57"
             )
         z, own = _numbers(where, fields[2]), usual if len(fields) == 3 else _numbers(where, fields[3])
-        if len(z) not in (3, 7):
-            raise click.UsageError(
-                f"{where}: {fields[2]} is {counted(len(z), 'number')}; wanted x,y,theta or x,y,z,qx,qy,qz,qw"
-            )
+        kind = _kind_of_pose(where, fields[2], z)
         if own is None:
             raise click.UsageError(f"{where} does not say how certain it is; give --sigmas, or a fourth field")
-        draft.factor("between_se2" if len(z) == 3 else "between_se3", fields[:2], z, sigmas=own)
+        draft.factor(kind, fields[:2], z, sigmas=own)
     return draft
 
 
@@ -165,9 +162,16 @@ def _draft(anchors: tuple[tuple[str, str, str], ...], sigmas: str | None) -> Any
     draft = Draft()
     for here, there, measured in anchors:
         z = _numbers("--anchor", measured)
-        kind = "between_se2" if len(z) == 3 else "between_se3"
+        kind = _kind_of_pose("--anchor", measured, z)
         draft.factor(kind, (here, there), z, sigmas=_numbers("--sigmas", sigmas))
     return draft
+
+
+def _kind_of_pose(where: str, text: str, z: list[float]) -> str:
+    """The kind of factor that a relative pose of so many numbers is.  Raises UsageError."""
+    if len(z) not in (3, 7):
+        raise click.UsageError(f"{where}: {text} is {counted(len(z), 'number')}; wanted x,y,theta or x,y,z,qx,qy,qz,qw")
+    return "between_se2" if len(z) == 3 else "between_se3"
 
 
 def _numbers(option: str, text: str) -> list[float]:
