@@ -158,6 +158,16 @@ def test_one_that_lives_is_not(bus: Bus, viewer: Bus) -> None:
         assert len(part.estimate) == 6
 
 
+def test_what_a_part_does_not_have_is_not_said_to_be_missing_in_the_map(bus: Bus, viewer: Bus) -> None:
+    with bus.map("lacking") as whole, viewer.map("lacking", interest=Interest("q", period_ms=10)) as part:
+        drive(whole, 0, 3)
+        for look in (lambda: part.estimate["x0"], lambda: part.estimate.columns("se2")):
+            with pytest.raises(
+                KeyError, match="in the part of map 'lacking' that its interest mirrors"
+            ):
+                look()
+
+
 def test_a_map_that_is_made_anew_is_followed(bus: Bus, viewer: Bus) -> None:
     with bus.map("anew", mirror=False) as whole, viewer.map("anew", interest=Interest("x", period_ms=10)) as part:
         drive(whole, 0, 9)

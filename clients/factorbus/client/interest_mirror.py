@@ -36,6 +36,7 @@ class InterestMirror(Mirror):
     def __init__(self, link: Link, map_name: str, timeout_s: float, interest: Interest) -> None:
         super().__init__(link, map_name, timeout_s)
         self.interest = interest
+        self._held_of = f"the part of map {map_name!r} that its interest mirrors here,"
         self._following: InterestFollowing = InterestFollowing()
         self._channel = ExitStack()
         self._renew_at = 0.0

@@ -56,8 +56,8 @@ class Mirror:
         self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._owners: set[str] = set()
         self._deserted = False  # the map had an owner, and has none now
-        self._expected = 0
-        self._confirmed_at = time.monotonic()
+        self._expected, self._confirmed_at = 0, time.monotonic()
+        self._held_of = f"map {map_name!r}"  # what is looked up in, for an error
         self._asking, self._probing, self._silences = False, False, 0
         self._ask_at = 0.0
         self._gave_up = ""  # why the map does not go on converging
@@ -131,7 +131,7 @@ class Mirror:
         with self._lock:
             found = self._following.values.find(number)
         if found is None:
-            raise NotHeld(f"{format_symbol(number)} is not in map {self._map!r} at revision {self.revision}")
+            raise NotHeld(f"{format_symbol(number)} is not in {self._held_of} at revision {self.revision}")
         return found
 
     def stamp(self, key: str | int) -> int | None:
@@ -145,7 +145,7 @@ class Mirror:
         with self._lock:
             columns = self._following.values.columns_of(kind)
         if columns is None:
-            raise NotHeld(f"no variables of kind {kind!r} in map {self._map!r} at revision {self.revision}")
+            raise NotHeld(f"no variables of kind {kind!r} in {self._held_of} at revision {self.revision}")
         return columns
 
     def snapshot(self) -> Snapshot:
