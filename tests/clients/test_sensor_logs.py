@@ -318,3 +318,12 @@ def test_a_simulated_log_has_the_poses_that_it_says(tmp_path: Path, capsys: pyte
     assert f"{folder}: 12 poses" in said
     assert f"{truth}: 12 poses, as they are" in said
     assert read_log(folder).steps().poses == len(truth.read_text().splitlines()) == 12
+
+
+def test_a_log_where_a_graph_is_wanted_is_told_how_one_is_made_of_it(
+    drive: tuple[Path, InertialWorld], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in (["convert", str(drive[0]), str(tmp_path / "a.g2o")], ["plot", "sparsity", str(drive[0])]):
+        assert main(arguments) == BAD_FILE
+        told = f"a log of an IMU; wanted a graph: factorbus replay {drive[0]} --in-process --out map.g2o makes one"
+        assert told in capsys.readouterr().err

@@ -162,9 +162,7 @@ def test_what_a_part_does_not_have_is_not_said_to_be_missing_in_the_map(bus: Bus
     with bus.map("lacking") as whole, viewer.map("lacking", interest=Interest("q", period_ms=10)) as part:
         drive(whole, 0, 3)
         for look in (lambda: part.estimate["x0"], lambda: part.estimate.columns("se2")):
-            with pytest.raises(
-                KeyError, match="in the part of map 'lacking' that its interest mirrors"
-            ):
+            with pytest.raises(KeyError, match="in the part of map 'lacking' that its interest mirrors"):
                 look()
 
 

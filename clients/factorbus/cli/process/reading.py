@@ -64,13 +64,22 @@ def read_graph(path: Path, dialect: str | None = None, strict: bool = False, who
     """
     from factorbus.formats import read
 
-    if dialect is None and is_recording(path):
+    if dialect is None and (what := _driven(path)):
         advice = f"factorbus replay {shlex.quote(str(path))} --in-process --out map.g2o makes one of it"
-        raise Stopped("bad_file", f"{path}: a robot's recording; wanted a graph: {advice}", BAD_FILE, path=str(path))
+        raise Stopped("bad_file", f"{path}: {what}; wanted a graph: {advice}", BAD_FILE, path=str(path))
 
     graph = read(path, dialect, strict, whole)
     say(path, graph.notes)
     return graph
+
+
+def _driven(path: Path) -> str:
+    """What a path is that is driven and is no graph; empty: it may be one."""
+    if is_recording(path):
+        return "a robot's recording"
+    from factorbus.cli.logs.recognize import has_log
+
+    return "a log of an IMU" if has_log(path) else ""
 
 
 def read_drive(path: Path, dialect: str | None = None, strict: bool = False) -> "GraphFile | SensorLog":
