@@ -15,6 +15,7 @@ from factorbus.cli.process.options import json_option
 _PAGES = Path(__file__).parents[1] / "codes.md"
 # Exceptions whose code is not their name in another spelling.
 _CODES = {
+    "bad_expression": "unknown_kind",
     "apart": "not_positive_definite", "bad_configuration_file": "bad_file", "broken": "internal",
     "closed_here": "unavailable", "factors_of_another": "wrong_epoch", "interest_ended": "busy",
     "no_mirror": "unavailable", "not_finite_numbers": "not_finite",

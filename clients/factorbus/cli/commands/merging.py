@@ -168,7 +168,7 @@ def _draft(anchors: tuple[tuple[str, str, str], ...], sigmas: str | None) -> Any
 
 
 def _kind_of_pose(where: str, text: str, z: list[float]) -> str:
-    """The kind of factor that a relative pose of so many numbers is.  Raises UsageError."""
+    """The kind of factor that a relative pose of 3 or 7 numbers is.  Raises UsageError."""
     if len(z) not in (3, 7):
         raise click.UsageError(f"{where}: {text} is {counted(len(z), 'number')}; wanted x,y,theta or x,y,z,qx,qy,qz,qw")
     return "between_se2" if len(z) == 3 else "between_se3"
