@@ -1,6 +1,7 @@
 """Every way a batch is refused, and that a refused batch leaves no trace."""
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from naive.random_graphs import random_steps
 from naive.solver_parts import graph_in, stepper_in, system_in
 from naive.tree_records import tree_of
 
+from factorbus.client import Draft
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.inc_l.steps import IncrementalSteps
@@ -340,3 +342,9 @@ def test_angles_are_wrapped_and_quaternions_made_unit() -> None:
 def test_a_refusal_says_where_the_other_is_and_what_was_tried(batch: Batch, said: str) -> None:
     with pytest.raises(errors.SolverError, match=said):
         small_map().stage(batch)
+
+
+def test_a_draft_is_no_batch_and_is_told_how_it_becomes_one() -> None:
+    draft: Any = Draft().se2("x0", (0, 0, 0), fixed=True)
+    with pytest.raises(errors.BadShape, match="seen an object of type Draft, wanted a Batch; of a Draft"):
+        small_map().stage(draft)

@@ -48,6 +48,8 @@ def admit(graph: FactorGraph, batch: BatchLike | Columns) -> int:
     BadQuaternion, BadRange, BadLens, BadObservation, BadLoss, NotPositiveDefinite, Uninitialized; `graph` is as
     it was then.
     """
+    if not isinstance(batch, Columns) and not hasattr(batch, "variables"):
+        raise errors.BadShape("batch", f"an object of type {type(batch).__name__}", "a Batch; of a Draft its batch()")
     raw, groups, problem = (batch.raw, batch.groups, None) if isinstance(batch, Columns) else locate_columns(batch)
     mark, own = graph.mark(), graph.own
     first = mark[at.FACTORS] + graph.id_shift
