@@ -348,3 +348,15 @@ def test_a_draft_is_no_batch_and_is_told_how_it_becomes_one() -> None:
     draft: Any = Draft().se2("x0", (0, 0, 0), fixed=True)
     with pytest.raises(errors.BadShape, match="seen an object of type Draft, wanted a Batch; of a Draft"):
         small_map().stage(draft)
+
+
+@pytest.mark.parametrize(
+    ("factor", "following", "said"),
+    [
+        (3, 0, "no factor 3: the map has had none so far;"),
+        (3, 2, "no factor 3: the next one will be 2;"),
+        (1, 2, "no factor 1: it has been removed, or is one of the map's suspects, which the estimate does not have;"),
+    ],
+)
+def test_a_factor_that_there_is_not_is_told_from_one_that_there_was(factor: int, following: int, said: str) -> None:
+    assert said in str(errors.UnknownFactor(factor, following))

@@ -74,7 +74,7 @@ def test_a_drive_with_false_closures(services: Callable[..., Services], tmp_path
         ran("change", "reject", "yard", str(first_in), *at)
         refused = json.loads(ran("change", "reject", "yard", "0", *at, code=5))
         assert refused["problem"]["code"] == "not_a_closure"
-        with pytest.raises(Refused, match="does not have, as ask/suspects says") as unknown:
+        with pytest.raises(Refused, match="one of the map's suspects, which the estimate does not have") as unknown:
             joined.uncertainty.why(factor=first_in)
         assert unknown.value.code == "unknown_factor"
         said = {out[0]: ("restored", "user"), first_in: ("rejected", "user")}
