@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from faulty.service import MAP, Service, point, same
 
+from factorbus.cli.process.bus import joined_when_there
 from factorbus.client import Unavailable, connect
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Variables
@@ -52,10 +53,27 @@ def test_a_map_that_comes_while_it_is_looked_for_is_not_its_own_correction(
     with connect(endpoint, timeout_s=5) as bus:
         found = bus.maps()
         monkeypatch.setattr(bus, "maps", lambda _timeout_s: [replace(row, name="attic") for row in found])
-        with pytest.raises(Refused) as caught:
+        with pytest.raises(UnknownMap) as caught:
             bus.map("attic", create=False)
-    assert caught.value.code == "unknown_map"
     assert "did you mean" not in caught.value.message
+
+
+def test_who_waits_for_a_map_goes_on_when_it_comes_between_two_of_the_questions(
+    start: Callable[..., Service], endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not there when it is asked, and there when those that are there are listed: `record` and `watch` wait on."""
+    start()
+    waited = list[float]()
+
+    def stopped(seconds: float) -> bool:
+        waited.append(seconds)
+        return len(waited) > 1
+
+    with connect(endpoint, timeout_s=5) as bus:
+        monkeypatch.setattr(bus, "maps", lambda _timeout_s: [replace(bus.create(MAP), name="attic")])
+        with joined_when_there(bus, "attic", stopped) as joined:
+            assert joined is None
+    assert len(waited) == 2
 
 
 @pytest.mark.parametrize("bad", ["127.0.0.1:7447", "", "tcp", "tcp/"])

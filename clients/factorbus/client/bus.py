@@ -266,7 +266,7 @@ class Bus:
             return refused
         try:
             names = [row.name for row in self.maps(min(self.timeout_s, _LIST_S))]
-            return refused if name in names else UnknownMap(name, names)  # it may have come since
+            return UnknownMap(name, None if name in names else names)  # it may have come since
         except Problem:
             return UnknownMap(name)
 
