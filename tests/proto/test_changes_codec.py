@@ -58,7 +58,7 @@ def test_each_is_read_as_it_was_written(name: str) -> None:
         ("remove_variables", {"alone": 1}, "alone"),
         ("loss", {"loss": "square"}, "loss"),
         ("loss", {"loss": 1}, "loss"),
-        ("loss", {"loss": ""}, "scale"),
+        ("loss", {"loss": None}, "scale"),
         ("place", {"kind": "se9"}, "kind"),
         ("place", {"values": NUMBERS}, "values"),
         ("weigh", {"weight": NUMBERS[:8]}, "weight"),

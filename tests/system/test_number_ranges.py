@@ -133,6 +133,7 @@ def test_whatever_a_field_holds_the_answer_is_one_of_the_contract(client: Bare, 
 
 
 EDGE = codec.encode_insert(Insert(1, Batch((), (edge("x0", "x1"),))))
+LOSS = {"change": "loss", "factors": bytes(8), "scale": np.ones(1).tobytes()}
 OUTSIDE: list[tuple[str, str, Any, str, str]] = [
     ("insert", "sequence", 0, "bad_message", "sequence"),
     ("insert", "sequence", -1, "bad_message", "sequence"),
@@ -152,6 +153,11 @@ OUTSIDE: list[tuple[str, str, Any, str, str]] = [
     ("ask/why key", "key", 2**63, "bad_message", "question.key"),
     ("ask/why key", "factor", 1, "bad_message", "question"),
     ("create", "mode", "x", "bad_option", "create.mode"),
+    *[("create", word, "", "bad_option", f"create.{word}") for word in ("mode", "closures", "keep")],
+    ("ask/covariance", "blocks", "", "bad_option", "question.blocks"),
+    ("ask/export", "ids", "", "bad_option", "question.ids"),
+    ("insert", "changes", [LOSS | {"loss": ""}], "bad_loss", "changes[0].loss"),
+    ("insert", "changes", [LOSS | {"loss": "soft"}], "bad_loss", "changes[0].loss"),
     ("drop", "revision", -1, "bad_message", "drop.revision"),
     *[("budget", "budget_ms", bad, "bad_option", "budget.budget_ms") for bad in (NAN, INF, -1, -TINY, 60_000.1)],
     ("budget", "budget_ms", None, "bad_message", "budget.budget_ms"),

@@ -63,11 +63,11 @@ def _read(index: int, content: Map) -> Change:
         return Change(name, keys=named, alone=name == "remove_variables" and fields.flag(place(), content, "alone"))
     if of.numbers == "weight":
         return Change(name, named, weight=fields.rows(place, content, "weight", named.size, 1).reshape(-1))
-    loss = fields.text(place(), content, "loss", default="") if of.numbers else ""
-    if not loss:
+    if not of.numbers or content.get("loss") is None:
         if of.numbers and content.get("scale") is not None:
             raise BadMessage(f"{place()}.scale", "a scale without a loss", f"loss: one of {', '.join(LOSSES)}")
         return Change(name, named)
+    loss = fields.text(place(), content, "loss")
     if loss not in LOSSES:
         raise BadLoss(f"{place()}.loss", repr(loss[:64]), f"one of {', '.join(LOSSES)}, or no such field")
     return Change(name, named, loss=loss, scale=fields.rows(place, content, "scale", named.size, 1).reshape(-1))

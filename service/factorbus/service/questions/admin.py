@@ -169,8 +169,10 @@ def read_create(payload: bytes) -> tuple[str, MadeAs]:
     budget_ms = None
     if content.get("budget_ms") is not None:
         budget_ms = fields.parameter("create", content, "budget_ms", BUDGET_SPAN_MS, BUDGET_WANTED, 0.0)
-    keep = fields.text("create", content, "keep", "") if content.get("keep") is not None else ""
-    return _map_name(content, "create"), MadeAs(mode, closures, budget_ms, keep and keep_text(keep, "create.keep"))
+    keep = ""
+    if content.get("keep") is not None:
+        keep = keep_text(fields.text("create", content, "keep"), "create.keep")
+    return _map_name(content, "create"), MadeAs(mode, closures, budget_ms, keep)
 
 
 class Drop(NamedTuple):
