@@ -20,7 +20,15 @@ from factorbus.journal.checkpoints import file_of, write_checkpoint
 from factorbus.journal.lock import own
 from factorbus.journal.problems import UnsafeJournal
 from factorbus.journal.store import create, open_store
-from factorbus.ownership import UnsafeFolder, check_file, check_folder, folders, make_private, why_unsafe
+from factorbus.ownership import (
+    UnsafeFolder,
+    check_file,
+    check_folder,
+    check_settings_file,
+    folders,
+    make_private,
+    why_unsafe,
+)
 
 ANOTHER = 4242
 SNEAK = "import fcntl, sys; fcntl.flock(open(sys.argv[1]), fcntl.LOCK_EX | fcntl.LOCK_NB); print('taken')"
@@ -162,6 +170,46 @@ def test_files_of_others_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPa
     give_away(file, monkeypatch)
     with pytest.raises(UnsafeFolder, match="belongs to user"):
         check_file("the kernel", file, file.stat())
+
+
+def test_settings_that_others_can_write_to_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = folder / "serve.toml"
+    file.write_text("")
+    for mode in (0o600, 0o644, 0o664):  # 0o664: writable by a group of this process, as umask 002 leaves it
+        file.chmod(mode)
+        check_settings_file("the settings", file)
+    file.chmod(0o646)
+    with pytest.raises(UnsafeFolder, match="everybody can write to it"):
+        check_settings_file("the settings", file)
+    file.chmod(0o644)
+    folder.chmod(0o777)
+    with pytest.raises(UnsafeFolder, match=r"it is in .*, which everybody can write to"):
+        check_settings_file("the settings", file)
+    folder.chmod(0o1777)
+    check_settings_file("the settings", file)
+    give_away(file, monkeypatch)
+    with pytest.raises(UnsafeFolder, match="belongs to user"):
+        check_settings_file("the settings", file)
+
+
+def test_settings_from_a_pipe_and_those_that_are_missing_are_for_who_reads_them(folder: Path) -> None:
+    os.mkfifo(folder / "pipe", 0o666)
+    for path in (folder / "pipe", folder / "missing", folder):
+        check_settings_file("the settings", path)
+
+
+def test_a_service_and_a_gateway_do_not_begin_with_them(folder: Path) -> None:
+    for name, text, command in (
+        ("serve.toml", "", ("serve", "--config")),
+        ("people.toml", f'[operator]\nann = "{"a" * 20}"\n', ("gateway", "--connect", "tcp/127.0.0.1:9", "--people")),
+    ):
+        file = folder / name
+        file.write_text(text)
+        file.chmod(0o666)
+        ran = factorbus(*command, str(file))
+        assert ran.returncode == REFUSED, ran.stderr
+        assert f"{file} is not used: everybody can write to it" in ran.stderr
+        assert "[unsafe_folder]" in ran.stderr
 
 
 def factorbus(*words: str, **environment: str) -> "subprocess.CompletedProcess[str]":

@@ -76,8 +76,8 @@ def keys(tmp_path: Path) -> dict[str, Any]:
 
 
 def test_keys_that_only_we_can_replace_are_taken(keys: dict[str, Any]) -> None:
-    refuse_unsafe_keys(keys.get)
-    refuse_unsafe_keys({}.get)
+    refuse_unsafe_keys("", keys.get)
+    refuse_unsafe_keys("", {}.get)
 
 
 @pytest.mark.parametrize(
@@ -98,5 +98,5 @@ def test_keys_that_others_can_replace_are_refused(keys: dict[str, Any], section:
     open_to_all = other if folder else moved
     open_to_all.chmod(0o777)
     with pytest.raises(UnsafeKeys, match="chmod go-w") as caught:
-        refuse_unsafe_keys(keys.get)
+        refuse_unsafe_keys("", keys.get)
     assert (caught.value.code, caught.value.detail["folder"]) == ("unsafe_folder", str(open_to_all))

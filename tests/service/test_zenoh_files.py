@@ -73,3 +73,18 @@ def test_a_replica_does_not_begin_with_keys_that_others_can_replace(
     with pytest.raises(BadConfig, match=r"key\.pem") as bad:
         app.serve(config, not_reached, threading.Event())
     assert bad.value.code == "unsafe_folder"
+
+
+@pytest.mark.parametrize("setting", ["zenoh", "upstream_zenoh"])
+def test_a_service_does_not_begin_with_a_configuration_that_others_can_write_to(
+    setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "ready_to_compute", not_reached)
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{}")
+    file.chmod(0o666)
+    config = replace(REPLICA, warm=False, **{setting: str(file)})
+    with pytest.raises(BadConfig, match=r"zenoh\.json5 is not used: everybody can write to it") as bad:
+        app.serve(config, not_reached, threading.Event())
+    assert bad.value.code == "unsafe_folder"

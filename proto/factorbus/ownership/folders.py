@@ -12,8 +12,9 @@ A folder is safe if
 On a file system that is mounted read-only nobody can write, so everything there is safe: keys and settings come to a
 container so.
 
-A file is safe if its owner is this user or root, and nobody else can write to it.  Where the system does not tell
-users apart (Windows) everything is safe.
+A file is safe if its owner is this user or root, and nobody else can write to it.  Of a file of settings, which people
+write, a group of this process may: what a user makes is often writable by a group that has nobody else in it.  Where the
+system does not tell users apart (Windows) everything is safe.
 """
 
 import os
@@ -70,6 +71,35 @@ def check_file(what: str, path: Path, status: os.stat_result) -> None:
     reason, mend = why_unsafe_itself(path, status, groups=set())
     if reason:
         raise UnsafeFolder(what, path, reason, mend)
+
+
+def check_settings_file(what: str, path: Path) -> None:
+    """Raises UnsafeFolder if others can change the file `path`, or put another one in its place; OSError.
+
+    What is no file, such as a pipe, is whoever's made it.
+    """
+    if not hasattr(os, "geteuid") or not path.is_file():
+        return
+    path = path.resolve()
+    reason, mend = "", ""
+    if not _is_read_only(path):
+        reason, mend = _why_unsafe_settings(path, path.stat())
+    if reason:
+        raise UnsafeFolder(what, path, reason, mend)
+
+
+def _why_unsafe_settings(path: Path, status: os.stat_result) -> tuple[str, str]:
+    user, mode = os.geteuid(), stat.S_IMODE(status.st_mode)
+    if status.st_uid not in (user, _ROOT):
+        mend = f"chown it to the user that runs this ({user}), or mount it read-only"
+        return f"it belongs to user {status.st_uid}", mend
+    if mode & stat.S_IWOTH or (mode & stat.S_IWGRP and status.st_gid not in {_ROOT, *_groups()}):
+        who = "everybody" if mode & stat.S_IWOTH else f"group {status.st_gid}"
+        return f"{who} can write to it (mode {mode:04o})", f"chmod go-w {_quoted(path)}"
+    found = ("", "")
+    for above in path.parents:
+        found = found if found[0] else _why_unsafe_above(path, above, above.stat())
+    return found
 
 
 def why_unsafe(path: Path) -> tuple[str, str]:

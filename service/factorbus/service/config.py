@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
+from factorbus.ownership import UnsafeFolder, check_settings_file
 from factorbus.proto.budget import BUDGET_SPAN_MS, BUDGET_WANTED
 from factorbus.proto.closures import CLOSURE_POLICIES
 from factorbus.proto.endpoints import checked_endpoint
@@ -28,6 +29,16 @@ class BadConfig(Problem):
     """A setting that does not exist or cannot have the value it was given."""
 
     code = "bad_config"
+
+
+class UnsafeConfig(BadConfig):
+    """Others could put settings of their own in the place of ours."""
+
+    code = "unsafe_folder"
+
+    def __init__(self, unsafe: UnsafeFolder) -> None:
+        super().__init__(unsafe.message)
+        self.detail |= unsafe.detail
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +121,17 @@ class Config:
 
 
 def load_config(path: str | Path, **overrides: Any) -> Config:
-    """The configuration in the TOML file `path`; `overrides` win.  Raises BadConfig, BadEndpoint, BadName, OSError."""
+    """The configuration in the TOML file `path`; `overrides` win.
+
+    Raises BadConfig, UnsafeConfig, BadEndpoint, BadName, OSError.
+    """
     if is_device(path):
         raise BadConfig(f"{path} is a device; wanted a file in TOML")
+    if not overrides.get("insecure"):
+        try:
+            check_settings_file("the configuration", Path(path))
+        except UnsafeFolder as unsafe:
+            raise UnsafeConfig(unsafe) from None
     with Path(path).open("rb") as file:
         try:
             content = tomllib.load(file)

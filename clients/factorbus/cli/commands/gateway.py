@@ -87,15 +87,17 @@ def command(insecure: bool, until_eof: bool, **asked: Any) -> None:
 
 
 def _people(request: GatewayRequest) -> "People":
-    """Who may edit.  Raises BadPeople, Stopped."""
+    """Who may edit.  Raises BadPeople, Stopped, UnsafeFolder."""
     from factorbus.cli.output.exits import input_file
     from factorbus.gateway.people import OPERATOR, VIEWER, People, Person, read_people
+    from factorbus.ownership import check_settings_file
 
     if request.read_only:
         return People(Person("local", VIEWER, "this gateway was started with --read-only"))
     if request.people is not None:
         usual = Person("local", VIEWER, "editing asks who you are: sign in with your token")
         with input_file(request.people):
+            check_settings_file("the list of people", request.people)
             return read_people(request.people.read_text(encoding="utf-8"), str(request.people), usual)
     if is_loopback(request.host) and "*" not in request.names:
         return People(Person("local", OPERATOR))

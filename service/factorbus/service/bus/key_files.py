@@ -4,8 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from factorbus.ownership import UnsafeFolder, check_file, check_folder
-from factorbus.service.config import BadConfig
+from factorbus.ownership import UnsafeFolder, check_file, check_folder, check_settings_file
+from factorbus.service.config import UnsafeConfig
 
 _FILES = {
     "transport/link/tls": (
@@ -19,21 +19,21 @@ _FILES = {
 }
 
 
-class UnsafeKeys(BadConfig):
+class UnsafeKeys(UnsafeConfig):
     """Others could put a key, a certificate or a list of users of their own in the place of ours."""
 
-    code = "unsafe_folder"
 
-    def __init__(self, unsafe: UnsafeFolder) -> None:
-        super().__init__(unsafe.message)
-        self.detail |= unsafe.detail
-
-
-def refuse_unsafe_keys(setting: Callable[[str], Any]) -> None:
-    """Raises UnsafeKeys.  setting: the value at a path of the Zenoh configuration, or None.
+def refuse_unsafe_keys(zenoh_file: str, setting: Callable[[str], Any]) -> None:
+    """Raises UnsafeKeys.  zenoh_file: the Zenoh configuration, which says who may do what; empty: there is none.
+    setting: the value at a path of it, or None.
 
     A file that is not there is left to Zenoh, which says so.
     """
+    if zenoh_file:
+        try:
+            check_settings_file("the Zenoh configuration", Path(zenoh_file))
+        except UnsafeFolder as unsafe:
+            raise UnsafeKeys(unsafe) from None
     for path, names in _FILES.items():
         named = setting(path) or {}
         for file in [Path(named[name]) for name in names if named.get(name)]:

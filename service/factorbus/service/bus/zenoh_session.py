@@ -43,7 +43,7 @@ def check_zenoh_files(config: Config) -> None:
     if config.upstream:
         settings = _upstream_settings(config.upstream, config.upstream_zenoh)
         if not config.insecure:
-            refuse_unsafe_keys(_reader(settings))
+            refuse_unsafe_keys(config.upstream_zenoh, _reader(settings))
 
 
 def open_service_bus(config: Config) -> "ServiceBus":
@@ -66,7 +66,7 @@ def open_service_bus(config: Config) -> "ServiceBus":
 def _service_settings(config: Config) -> zenoh.Config:
     settings = _settings(config.zenoh, zenoh_settings(config))
     if not config.insecure:
-        refuse_unsafe_keys(_reader(settings))
+        refuse_unsafe_keys(config.zenoh, _reader(settings))
         if config.mode != "client":
             refuse_exposed(config.listen, _reader(settings))
     return settings
