@@ -93,7 +93,7 @@ def test_set_up_runs_again_only_when_what_is_installed_has_changed(tmp_path: Pat
 
 
 def test_the_deployed_configuration_is_one_that_serve_takes() -> None:
-    config = load_config(ROOT / "deploy/systemd/serve.toml")
+    config = load_config(ROOT / "deploy/systemd/serve.toml", insecure=True)
     assert config.listen == ("tcp/127.0.0.1:7447",)
 
 

@@ -25,7 +25,8 @@ _CODES = {
     "map_there": "map_exists", "no_pose": "unknown_variable", "nobody_listens": "unavailable",
     "not_here": "unknown_map", "missing_variables": "unknown_variable",
     "not_in_map": "unknown_variable", "solver_error": "problem",
-    "unsafe_journal": "unsafe_folder", "unsafe_keys": "unsafe_folder", "unusable": "internal",
+    "unsafe_config": "unsafe_folder", "unsafe_journal": "unsafe_folder", "unsafe_keys": "unsafe_folder",
+    "unusable": "internal",
 }  # fmt: skip
 
 
