@@ -16,7 +16,7 @@ from factorbus.cli.process.bus import joined_when_there
 from factorbus.client import Unavailable, connect
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Variables
-from factorbus.proto.problems import BadEndpoint, BadName, BadSetting, Refused, TooLarge, UnknownMap
+from factorbus.proto.problems import BadEndpoint, BadName, BadSetting, TooLarge, UnknownMap
 
 
 def test_nobody_there_is_said_within_the_time_given(endpoint: str) -> None:

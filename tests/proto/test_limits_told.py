@@ -1,5 +1,6 @@
 """The numbers of §6, §7 and §12 of the contract are those that a service has when nobody sets others."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -36,3 +37,36 @@ MIB = 1 << 20
 def test_a_number_on_the_page_is_the_one_in_force(told: str, is_so: bool) -> None:
     assert told in PAGE
     assert is_so
+
+
+# Each limit by which something is refused, as the page has it, and its number.
+REFUSES = {
+    "maps": ("maps of one service (`limits.maps`) | 64 that are open", 64),
+    "sessions": ("sessions with one service (`limits.sessions`) | 1000", 1000),
+    "variables": ("one map | 20,000,000 variables", 20_000_000),
+    "factors": ("variables, 100,000,000 factors |", 100_000_000),
+    "clients": ("client names per map | 1024", 1024),
+    "waiting": ("waiting inserts per map | 256", 256),
+    "waiting_bytes": ("waiting inserts per map | 256, 256 MiB together", 256 * MIB),
+    "changes": ("changes of one client without an answer | 64", 64),
+    "questions": ("that wait to be computed | 256 each", 256),
+    "interests": ("different interests per map (`limits.interests`) | 64", 64),
+    "jobs": ("for a batch optimum, and those for features, under way | 64 each: `busy`", 64),
+    "message_bytes": ("one message to the service | 64 MiB", 64 * MIB),
+    "answer_bytes": ("one answer | 256 MiB", 256 * MIB),
+    "insert_variables": ("one insert | 1,000,000 variables", 1_000_000),
+    "insert_factors": ("1,000,000 variables, 1,000,000 factors", 1_000_000),
+    "memory_bytes": ("left below `limits.memory_bytes`", 0),
+    "remembered": ("(the last 1024 per client are remembered)", 1024),
+    "parked_s": ("gap open for 5 s: `bad_sequence`", 5.0),
+    "client_idle_s": ("after 10 minutes of silence", 600.0),
+}
+REFUSES_NOTHING = {
+    "interest_lease_s", "snapshot_bytes", "snapshot_steps", "step_bytes", "step_inserts", "unwritten",
+}  # fmt: skip
+
+
+def test_every_limit_that_refuses_something_is_on_the_page() -> None:
+    assert REFUSES.keys() | REFUSES_NOTHING == {each.name for each in fields(Limits)}
+    assert [name for name, (told, _) in REFUSES.items() if told not in PAGE] == []
+    assert {name: getattr(SET, name) for name in REFUSES} == {name: is_set for name, (_, is_set) in REFUSES.items()}

@@ -12,9 +12,10 @@ A folder is safe if
 On a file system that is mounted read-only nobody can write, so everything there is safe: keys and settings come to a
 container so.
 
-A file is safe if its owner is this user or root, and nobody else can write to it.  Of a file of settings, which people
-write, a group of this process may: what a user makes is often writable by a group that has nobody else in it.  Where the
-system does not tell users apart (Windows) everything is safe.
+A file is safe if its owner is this user or root, and nobody else can write to it.  A file of settings, which people
+write, may be writable by a group of this process: what a user makes often is, by a group that has nobody else in it.
+
+Where the system does not tell users apart (Windows) everything is safe.
 """
 
 import os
@@ -76,7 +77,7 @@ def check_file(what: str, path: Path, status: os.stat_result) -> None:
 def check_settings_file(what: str, path: Path) -> None:
     """Raises UnsafeFolder if others can change the file `path`, or put another one in its place; OSError.
 
-    What is no file, such as a pipe, is whoever's made it.
+    What is no regular file, such as a pipe, is not looked at.
     """
     if not hasattr(os, "geteuid") or not path.is_file():
         return
