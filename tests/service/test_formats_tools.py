@@ -185,6 +185,14 @@ def test_a_switchable_edge_has_a_loss(tmp_path: Path) -> None:
     assert graph.steps()[3].factors[1].loss == "dcs"
 
 
+def test_a_switch_of_no_edge_is_not_said_to_be_a_loss(tmp_path: Path) -> None:
+    graph = read_text(tmp_path, loop() + "VERTEX_SWITCH 4 1\nEDGE_SWITCH_PRIOR 4 1 9\n")
+    assert not [group for group in graph.batch.factors if group.loss]
+    assert list(graph.notes) == [
+        f"1 {name} left out: no edge that is read has a switch" for name in ("VERTEX_SWITCH", "EDGE_SWITCH_PRIOR")
+    ]
+
+
 @pytest.mark.parametrize(("weight", "is_null"), [("1e-2", True), ("1e-9", False), ("0", False)])
 def test_a_mixture_is_its_likelier_component(tmp_path: Path, weight: str, is_null: bool) -> None:
     """At the values of the file: rᵀΩr = 2 + 3.14², and 1.5 ln w against −(1 − w) times that."""

@@ -228,6 +228,16 @@ def test_of_a_map_key_that_comes_twice_the_last_counts(client: Bare) -> None:
     assert sent(client, "map/double/in/twice", twice)["sequence"] == 1
 
 
+def test_a_key_that_is_a_bin_names_no_field_and_any_other_that_is_no_string_is_refused(client: Bare) -> None:
+    name, number = chain(client, "binary"), b"\xa8sequence\x01"
+    assert sent(client, f"map/{name}/in/bin-1", b"\x82" + number + b"\xc4\x04what\x01")["sequence"] == 1
+    refused(sent(client, f"map/{name}/in/bin-2", b"\x81\xc4\x08sequence\x01"), "bad_message", where="sequence", next=1)
+    for place, key_of in enumerate((b"\x05", b"\xc0", b"\xc3", b"\xcb" + bytes(8), b"\x90")):
+        came = sent(client, f"map/{name}/in/other-{place}", b"\x82" + number + key_of + b"\x01")
+        refused(came, "bad_message", next=2)
+    assert ask(client, f"map/{name}/ask/stats")["revision"] == 2
+
+
 def test_the_second_run_of_a_name_gets_the_old_answer_to_the_same_bytes_and_else_bad_sequence(client: Bare) -> None:
     chain(client, "runs")
     first = packed({"sequence": 1})

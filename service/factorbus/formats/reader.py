@@ -184,10 +184,12 @@ def _leave_foreign(file: str, dialect: Dialect, buckets: Mapping[str, Bucket], l
     for name, note in dialect.unspoken.items():
         if name in buckets:
             left.say(f"{len(buckets[name].rests)} {note}")
+    switched = any(dialect.edges[name].lead == "switch" for name in buckets if name in dialect.edges)
+    of_switches = "its edge has a loss instead" if switched else "no edge that is read has a switch"
     for name in foreign:
         if not (dialect is G2O and name in _CAMERAS):
             short = name if len(name) <= 40 else name[:37] + "..."
-            instead = "its edge has a loss instead" if name in _SWITCHES else f"no {dialect.name} record that is read"
+            instead = of_switches if name in _SWITCHES else f"no {dialect.name} record that is read"
             left.leave(short, buckets[name].numbers, instead)
 
 
