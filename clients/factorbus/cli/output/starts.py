@@ -11,8 +11,13 @@ _ROUNDING = 1e-9  # a χ² below this is what rounding left of a fit without any
 
 
 def ratio_to(chi2: float, batch: float) -> str:
-    """χ² over that of the batch optimum; "-" where there is nothing but rounding to compare."""
-    return "-" if not batch or max(chi2, batch) < _ROUNDING else f"{chi2 / batch:.9f}"
+    """χ² over that of the batch optimum; "-" where there is nothing but rounding to compare.
+
+    Where the optimum's is nothing but rounding: what the ratio is above.
+    """
+    if max(chi2, batch) < _ROUNDING:
+        return "-"
+    return f"{chi2 / batch:.9f}" if batch >= _ROUNDING else f"above {chi2 / _ROUNDING:.0e}"
 
 
 def optimum_from(start: str, file_values: bool = False, converged: bool = True) -> str:
