@@ -300,8 +300,9 @@ class UnknownFactor(SolverError):
     code = "unknown_factor"
 
     def __init__(self, factor: int, following: int) -> None:
-        gone = "it has been removed, or is a loop closure that the estimate does not have, as ask/suspects says"
-        seen = gone if 0 <= factor < following else f"the next one will be {following}"
+        gone = "it has been removed, or is one of the map's suspects, which the estimate does not have"
+        never = f"the next one will be {following}" if following else "the map has had none so far"
+        seen = gone if 0 <= factor < following else never
         super().__init__(
             f"there is no factor {factor}: {seen}; ids are in the answer to an insert, and in the graph of the map",
             factor=factor,
@@ -380,8 +381,7 @@ class Uninitialized(SolverError):
         listed = ", ".join(factors[:4]) + (", ..." if len(factors) > 4 else "")
         why = f"what is on it in its batch, {listed}, gives it none" if factors else "no factor of its batch is on it"
         super().__init__(
-            f"variable {printed(key)} has no value and {why}; give it a value, or a factor that leads to it from a "
-            "variable with one",
+            f"variable {printed(key)} has no value and {why}; give it one, or a factor from a variable that has one",
             key=key,
         )
 
