@@ -31,7 +31,7 @@ from factorbus.cli.process.reading import reading_options, told_of
 from factorbus.cli.process.robot_options import robot_options
 from factorbus.ros2.options import RobotOptions
 
-_ANSWER_S, _LISTENING_S = 10.0, 1.0
+_ANSWER_S, _LISTENING_S = 10.0, 0.6
 
 
 @dataclass(frozen=True, slots=True)

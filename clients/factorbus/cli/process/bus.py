@@ -1,4 +1,4 @@
-"""How commands come to the bus: an address where nobody listens is said within about a second."""
+"""How commands come to the bus: an address where nobody listens is said within a second, starting included."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ from factorbus.cli.process.options import MapAddress
 if TYPE_CHECKING:
     from factorbus.client import Bus, Interest, Map
 
-_LISTENING_S = 1.0
+_LISTENING_S = 0.6
 
 
 def open_bus(endpoint: str, client: str, zenoh: str = "", timeout_s: float = 10.0) -> "Bus":
