@@ -27,7 +27,7 @@ R = TypeVar("R", bound=Factor)
 _FAR = 256.0
 # Of (6.5): the largest entry, in metres and radians, of what gradients are a difference along; the share of the
 # decrease at which its iterations end, and at most how many there are.
-_DIFFERENCE, _NEWTON_LEFT, _NEWTON_ITERATIONS = 1e-6, 1e-4, 50
+_DIFFERENCE, _NEWTON_LEFT, _NEWTON_ITERATIONS = 1e-6, 1e-4, 25
 _LEAST_NORMAL = 2.0**-1022
 _FREE_DIRECTION = (
     "together they leave it a direction to move in; add a prior, or a factor that measures what these do not"
