@@ -82,7 +82,7 @@ def test_set_up_runs_again_only_when_what_is_installed_has_changed(tmp_path: Pat
         )
         return made.stdout
 
-    assert "deploy/setup/environment.sh .venv service,viz," in planned()
+    assert "deploy/setup/environment.sh .venv service,metis,viz," in planned()
     stamp = tmp_path / ".venv" / ".ready-dev"
     stamp.parent.mkdir()
     stamp.touch()
