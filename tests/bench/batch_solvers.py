@@ -19,6 +19,7 @@ from factorbus.solver import BatchSearch, chi2_at, solve_batch
 
 _TOLERANCE = 1e-6  # of GTSAM and g2o: the relative decrease below which they stop; ours stops at 1e-11, predicted
 _MOST = 200
+_RIGID = 1e-6  # metres and radians of GTSAM's priors where several variables are held, so that measurements pull at them
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +69,9 @@ def gtsam_optimizer(make: str) -> Callable[[Batch], Prepared]:
         for group in graph.variables:
             for key, row in zip(group.keys.tolist(), group.values, strict=True):
                 insert_value(values, group.kind, key, row)
-        for group in graph.variables:
-            for key in group.keys.tolist() if group.fixed else ():
-                factors.add(held(group.kind, key, values))
+        fixed = [(group.kind, key) for group in graph.variables if group.fixed for key in group.keys.tolist()]
+        for kind, key in fixed:
+            factors.add(held(kind, key, values, *([_RIGID] if len(fixed) > 1 else [])))
         for group in graph.factors:
             for factor in gtsam_factors(group):
                 factors.add(factor)
@@ -100,16 +101,14 @@ def gtsam_optimizer(make: str) -> Callable[[Batch], Prepared]:
 
 
 def g2o_optimizer(make: str) -> Callable[[Batch], Prepared]:
-    """g2o's: lm or gn, with blocks of fixed size where there are poses alone, and Eigen's sparse Cholesky."""
+    """g2o's: lm or gn, with blocks of fixed size where it has them for the graph, and Eigen's sparse Cholesky."""
 
     def prepare(graph: Batch) -> Prepared:
         import g2opy as g2o
-        from bench.replays.g2o_batch import EDGES, VERTICES
+        from bench.g2o_models import g2o_model
 
-        kinds = {group.kind for group in graph.variables}
-        # g2o's names: its solver "SE2" is that of poses and points in the plane, "SE3" that of 6 and 3.
-        size = "SE3" if kinds == {"se3"} else "X"
-        solver = getattr(g2o, f"BlockSolver{size}")(getattr(g2o, f"LinearSolverEigen{size}")())
+        model = g2o_model(graph)
+        solver = getattr(g2o, f"BlockSolver{model.size}")(getattr(g2o, f"LinearSolverEigen{model.size}")())
         make_algorithm = g2o.OptimizationAlgorithmGaussNewton if make == "gn" else g2o.OptimizationAlgorithmLevenberg
         algorithm, optimizer = make_algorithm(solver), g2o.SparseOptimizer()
         optimizer.set_algorithm(algorithm)
@@ -119,8 +118,8 @@ def g2o_optimizer(make: str) -> Callable[[Batch], Prepared]:
         optimizer.add_post_iteration_action(enough)
         vertices: dict[int, tuple[Any, F64]] = {}
         for group in graph.variables:
-            for key, row in zip(group.keys.tolist(), group.values, strict=True):
-                vertex = VERTICES[group.kind]()
+            for key, given in zip(group.keys.tolist(), group.values, strict=True):
+                vertex, row = model.vertex(group.kind), model.turned(group.kind, given)
                 vertex.set_id(len(vertices))
                 vertex.set_fixed(group.fixed)
                 vertex.set_estimate_data(row)
@@ -128,20 +127,16 @@ def g2o_optimizer(make: str) -> Callable[[Batch], Prepared]:
                 vertices[key] = vertex, row
         edges = []
         for group in graph.factors:
-            if group.kind not in EDGES:
-                raise Failed(f"no edge for {group.kind} here")
             for ends, z, omega in zip(group.keys.tolist(), group.measured, symmetric(group.information), strict=True):
-                edge = EDGES[group.kind]()
-                for n, key in enumerate(ends):
-                    edge.set_vertex(n, vertices[key][0])
-                edge.set_measurement_data(z)
+                edge = model.edge(group.kind, z, [vertices[key][0] for key in ends])
                 edge.set_information(omega)
                 optimizer.add_edge(edge)
                 edges.append(edge)
 
         def read() -> tuple[Variables, ...]:
+            rows = {key: np.array(vertex.get_estimate_data(), float) for key, (vertex, _) in vertices.items()}
             return tuple(
-                g._replace(values=np.array([vertices[key][0].get_estimate_data() for key in g.keys.tolist()], float))
+                g._replace(values=np.array([model.turned(g.kind, rows[key]) for key in g.keys.tolist()]))
                 for g in graph.variables
             )
 

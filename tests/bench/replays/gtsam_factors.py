@@ -13,6 +13,7 @@ from .columns import F64, symmetric
 from .contestants import Failed
 
 _TIGHT = 1e-4  # metres and radians of the prior that holds the first pose; nothing pulls at it
+_RADTAN = 1.0  # the code of lenses with and without such distortion
 _HALVES = np.array([1, 1, 1, 0.5, 0.5, 0.5])
 
 
@@ -35,15 +36,15 @@ def gtsam_factors(group: Factors, as_gtsam_reads: bool = False) -> Iterator[Any]
         yield factor
 
 
-def held(kind: str, key: int, values: Any) -> Any:
-    """A prior that holds a pose, or a point, where it is."""
+def held(kind: str, key: int, values: Any, sigma: float = _TIGHT) -> Any:
+    """A prior that holds a pose, or a point, where it is, to `sigma` (metres, radians)."""
     if kind == "point2":
-        return gtsam.PriorFactorPoint2(key, values.atPoint2(key), gtsam.noiseModel.Isotropic.Sigma(2, _TIGHT))
+        return gtsam.PriorFactorPoint2(key, values.atPoint2(key), gtsam.noiseModel.Isotropic.Sigma(2, sigma))
     if kind == "point3":
-        return gtsam.PriorFactorPoint3(key, values.atPoint3(key), gtsam.noiseModel.Isotropic.Sigma(3, _TIGHT))
+        return gtsam.PriorFactorPoint3(key, values.atPoint3(key), gtsam.noiseModel.Isotropic.Sigma(3, sigma))
     if kind == "se2":
-        return gtsam.PriorFactorPose2(key, values.atPose2(key), gtsam.noiseModel.Isotropic.Sigma(3, _TIGHT))
-    return gtsam.PriorFactorPose3(key, values.atPose3(key), gtsam.noiseModel.Isotropic.Sigma(6, _TIGHT))
+        return gtsam.PriorFactorPose2(key, values.atPose2(key), gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+    return gtsam.PriorFactorPose3(key, values.atPose3(key), gtsam.noiseModel.Isotropic.Sigma(6, sigma))
 
 
 def pose3(value: F64) -> Any:
@@ -87,6 +88,15 @@ def _range(make: Callable[..., Any]) -> Callable[..., Any]:
         return make(i, j, float(z[0]), gtsam.noiseModel.Gaussian.Information(information))
 
     return factor
+
+
+def _point_seen(i: int, j: int, z: F64, information: F64) -> Any:
+    code, fx, fy, cx, cy = z[2:7].tolist()
+    if code != _RADTAN or z[7:].any():
+        raise Failed(f"a lens {z[2:].tolist()}: GTSAM's factor is made here for one without distortion")
+    noise = gtsam.noiseModel.Gaussian.Information(information)
+    camera = gtsam.Cal3_S2(fx, fy, 0.0, cx, cy)
+    return gtsam.GenericProjectionFactorCal3_S2(z[:2].copy(), noise, i, j, camera)
 
 
 def _prior_se2(i: int, z: F64, information: F64) -> Any:
@@ -134,6 +144,7 @@ _FACTORS: dict[str, Callable[..., Any]] = {
     "range_se3": _range(gtsam.RangeFactor3D),
     "range_between_se2": _range(gtsam.RangeFactorPose2),
     "range_between_se3": _range(gtsam.RangeFactorPose3),
+    "point_seen": _point_seen,
     "prior_se2": _prior_se2,
     "prior_se3": _prior_se3,
     "position_se2": _position_se2,

@@ -245,4 +245,5 @@ _EXTRACT = {
     "se2": (lambda values: gtsam.utilities.extractPose2(values), ord("x")),
     "se3": (_extract_pose3, ord("x")),
     "point2": (lambda values: gtsam.utilities.extractPoint2(values), ord("l")),
+    "point3": (lambda values: gtsam.utilities.extractPoint3(values), ord("l")),
 }

@@ -66,7 +66,7 @@ def few_landmarks(poses: int, seed: int) -> Iterator[Batch]:
         yield Batch(tuple(variables), tuple(factors))
 
 
-def torus(poses: int, seed: int) -> Iterator[Batch]:
+def torus(poses: int, seed: int, sigmas: F64 = _IN_SPACE) -> Iterator[Batch]:
     """Each pose knows the one before and the one a turn earlier; some the one of the lap before."""
     rng, lap = np.random.default_rng([seed, 6]), _RING * _RINGS
     truth = _on_torus(np.arange(poses))
@@ -75,9 +75,9 @@ def torus(poses: int, seed: int) -> Iterator[Batch]:
         factors = ()
         if others:
             T = relative_se3(truth[others], np.repeat(truth[n : n + 1], len(others), axis=0))
-            z = noisy_se3(T, rng.normal(size=(len(others), 6)) * _IN_SPACE)
+            z = noisy_se3(T, rng.normal(size=(len(others), 6)) * sigmas)
             pairs = np.array([[other, n] for other in others])
-            factors = (_between("between_se3", pairs, z, _IN_SPACE),)
+            factors = (_between("between_se3", pairs, z, sigmas),)
         yield Batch((_pose("se3", n, truth),), factors)
 
 
