@@ -9,6 +9,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from factorbus.solver.kernels.jit.compile import I64
+from factorbus.solver.sparse.child_order import with_few_waiting
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
@@ -18,16 +19,16 @@ _WORTH_ASKING = 3.3e5
 
 
 def analyze_whole(dims: I64, rows: I64, cols: I64, times: int = 1) -> Symbolic:
-    """As `analyze`, by whichever order makes R by less: minimum degree, or nested dissection.
+    """As `analyze`, by whichever order makes R by less, minimum degree or nested dissection, and in little memory.
 
     dims (n,): scalars of each variable.  rows, cols (nb,): the blocks of Λ.  times: how often it will be eliminated,
     about.  Raises ValueError as `analyze`.
     """
     symbolic = analyze(dims, rows, cols, order(dims, rows, cols))
     if times * symbolic.flops <= _WORTH_ASKING * len(dims) or find_spec("pymetis") is None:
-        return symbolic
+        return with_few_waiting(symbolic, rows, cols)
     dissected = analyze(dims, rows, cols, dissect(dims, rows, cols))
-    return dissected if dissected.flops < symbolic.flops else symbolic
+    return with_few_waiting(dissected if dissected.flops < symbolic.flops else symbolic, rows, cols)
 
 
 def dissect(dims: I64, rows: I64, cols: I64) -> I64:

@@ -11,6 +11,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.carried import carry, tied
 from factorbus.solver.starts.components import components_of, docked
 from factorbus.solver.starts.losses import narrowing, weights_of
+from factorbus.solver.starts.normal import summed
 from factorbus.solver.starts.relations import (
     MAP,
     PLANE,
@@ -48,7 +49,8 @@ class Nodes:
 
 
 def averaged(graph: FactorGraph, order: I64 | None = None) -> list[F64]:
-    """Values for a graph, laid out as its own, from averaged rotations: none if it has no poses or nothing holds them.
+    """Values for a graph, laid out as its own, from averaged rotations: none if it has no poses, nothing holds them, or
+    its factors are of sorts, such as pixels, that say nothing of rotations or places by themselves.
 
     Two if it has points whose places are measured: rotations by themselves, and together with places.  The values that
     the graph has count only where the factors leave something open, as how far along a ray a point is.
@@ -56,6 +58,7 @@ def averaged(graph: FactorGraph, order: I64 | None = None) -> list[F64]:
     """
     kinds = graph.var[: graph.counts[at.VARIABLES], at.V_KIND]
     spaces = [_Averaging(graph, space, order) for space in (PLANE, SPACE) if (kinds == space.pose).any()]
+    spaces = [each for each in spaces if each.says_something]
     found = []
     for together in (False, True) if any(each.has_places for each in spaces) else (False,):
         values = graph.values.copy()
@@ -71,6 +74,7 @@ class _Averaging:
     def __init__(self, graph: FactorGraph, space: PoseSpace, order: I64 | None) -> None:
         self._graph, self._space, self._nodes = graph, space, _nodes(graph, space, order)
         relations, self._directions = relations_of(graph, space)
+        self.says_something = bool(len(relations) or len(self._directions.b))
         self.has_places = bool((self._nodes.point[relations.b] & (relations.a != MAP)).any())
         self._relations = tied(graph, space, relations, self._nodes.R, self._nodes.t)
 
@@ -163,10 +167,11 @@ def _bring_together(relations: Relations, directions: Directions, nodes: Nodes, 
         if len(left) == len(loose):
             break
         loose = left
-    for members in (label == each for each in loose):  # as they lie now
-        R[members] = (
-            nearest_rotations((nodes.R[members] @ R[members].transpose(0, 2, 1)).sum(axis=0)[None])[0] @ R[members]
-        )
+    if loose:  # as they lie now
+        of = np.isin(label, loose)
+        _, which = np.unique(label[of], return_inverse=True)
+        turns = summed(which, nodes.R[of] @ R[of].transpose(0, 2, 1), len(loose))
+        R[of] = nearest_rotations(turns)[which] @ R[of]
     return R
 
 
