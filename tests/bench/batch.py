@@ -1,4 +1,4 @@
-"""Whole graphs, from file values and from composed odometry, by ours and by other libraries.
+"""Whole graphs, from file values, composed odometry or values given, by ours and by other libraries.
 
     factorbus bench batch [--quick] [--only NAME,...] [--solvers NAME;...] [--repetitions N] [--seed N] [--page FILE]
                           [--json]
@@ -13,7 +13,8 @@ clock, ordering is.  In one process on one core, the solvers in turn, the least 
 
 χ² is that of the end of each in g2o's convention; own_chi2 that of GTSAM's factors, whose residuals are other ones.
 Simulated worlds are drawn anew at every run (--seed N draws them again): streets of 10,000 and 100,000 poses, a sphere
-of 10,000, and one of 2,500 with so much noise in its rotations that odometry leads nowhere.
+of 10,000, a sphere and a torus of 2,500 with so much noise in their rotations, 0.2 rad, that odometry leads nowhere,
+and bundle adjustment: 300 cameras and 5,000 points, pixels with 1 px of noise, from values 5 cm, 1° and 10 cm off.
 
 A solver that takes more than 20 s runs once.
 
@@ -42,9 +43,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.batch_page import ELSEWHERE, page
 from bench.batch_solvers import BATCH_SOLVERS, OURS, OURS_ALONE, PEER, BatchSolver, chi2_at_end
+from bench.bundle_world import bundle
 from bench.replays.contestants import Failed
 from bench.replays.problems import ALL, choose, file_of
 from bench.replays.runner import machine, pick_core
+from bench.replays.worlds import batches, torus
 
 from factorbus.cli.driving.columns import merged
 from factorbus.formats import read
@@ -57,18 +60,22 @@ _LONG_S = 20.0
 _THERE = ELSEWHERE  # an end below this, in χ² of the lowest, is the optimum, perhaps of a slightly different sum
 _ON_REQUEST = ("gtsam lm, qr",)
 _QUICK_SETS = ("intel", "manhattan3500", "killian")
-WORLDS: dict[str, tuple[int, Callable[[int, int], Any]]] = {
-    "streets": (10_000, lambda poses, seed: manhattan(poses, seed)),
-    "streets-large": (100_000, lambda poses, seed: manhattan(poses, seed)),
-    "sphere": (10_000, lambda poses, seed: sphere(poses, seed, spiral=Spiral(100, 100))),
-    "sphere-noisy": (2_500, lambda poses, seed: sphere(poses, seed, sigma_rotation_rad=0.2)),
+_NOISY_RAD = 0.2  # about each axis, from a pose to the next
+_NOISY = np.array([0.1] * 3 + [_NOISY_RAD / 2] * 3)  # metres, and the vector part of a quaternion: half the angle
+DRIVES: dict[str, tuple[int, Callable[[int, int], Iterator[Batch]]]] = {
+    "streets": (10_000, lambda poses, seed: batches(manhattan(poses, seed))),
+    "streets-large": (100_000, lambda poses, seed: batches(manhattan(poses, seed))),
+    "sphere": (10_000, lambda poses, seed: batches(sphere(poses, seed, spiral=Spiral(100, 100)))),
+    "sphere-noisy": (2_500, lambda poses, seed: batches(sphere(poses, seed, sigma_rotation_rad=_NOISY_RAD))),
+    "torus-noisy": (2_500, lambda poses, seed: torus(poses, seed, _NOISY)),
 }
-_QUICK_WORLDS = {"streets": 2_000, "sphere-noisy": 500}
+BUNDLES: dict[str, tuple[int, Callable[[int, int], Batch]]] = {"bundle": (300, bundle)}
+_QUICK_WORLDS = {"streets": 2_000, "sphere-noisy": 500, "torus-noisy": 500, "bundle": 60}
 
 
 @dataclass(frozen=True, slots=True)
 class Started:
-    """A graph with values for all, and what these are: "file" or "odometry"."""
+    """A graph with values for all, and what these are: "file", "odometry" or "given"."""
 
     dataset: str
     start: str
@@ -105,12 +112,15 @@ def graphs(quick: bool, only: Sequence[str], seed: int) -> Iterator[Started]:
         yield Started(problem.name, "odometry", composed(graph))
         if all(group.values is not None for group in graph.variables):
             yield Started(problem.name, "file", graph)
-    for name, (poses, world) in WORLDS.items():
+    for name, (size, world) in (DRIVES | BUNDLES).items():
         if (only and name not in only) or (quick and name not in _QUICK_WORLDS):
             continue
-        poses = _QUICK_WORLDS[name] if quick else poses
-        steps = [step.batch for step in islice(world(poses, seed), poses)]
-        yield Started(f"{name}-{poses}", "odometry", composed(merged(steps)))
+        size = _QUICK_WORLDS[name] if quick else size
+        made = world(size, seed)
+        if isinstance(made, Batch):
+            yield Started(f"{name}-{size}", "given", made)
+        else:
+            yield Started(f"{name}-{size}", "odometry", composed(merged([*islice(made, size)])))
 
 
 def composed(graph: Batch) -> Batch:
@@ -245,7 +255,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     listed = lambda text: [word.strip() for word in text.split(",") if word.strip()]  # noqa: E731
     solvers = lambda text: [word.strip() for word in text.split(";") if word.strip()]  # noqa: E731
-    parser.add_argument("--quick", action="store_true", help="three small data sets and two small worlds: two minutes")
+    parser.add_argument("--quick", action="store_true", help="three small data sets and four small worlds: two minutes")
     parser.add_argument("--only", type=listed, default=[], metavar="NAME,...", help="these data sets and worlds")
     parser.add_argument("--solvers", type=solvers, default=[], metavar="NAME;...", help="these solvers")
     parser.add_argument("--repetitions", type=int, default=0, metavar="N", help="of each; the least counts (5)")

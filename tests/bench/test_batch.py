@@ -3,27 +3,40 @@
 import json
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from bench import batch
 from bench.batch_solvers import BATCH_SOLVERS, OURS, OURS_ALONE, PEER, chi2_at_end
+from bench.bundle_world import bundle
+from bench.replays.contestants import Failed
+from bench.replays.worlds import batches, on_torus, torus
 
 from factorbus.cli.driving.columns import merged
+from factorbus.proto.messages import Batch
 from factorbus.simulate import Spiral, city_trees, manhattan, sphere
+from factorbus.simulate.step import POSE
+from factorbus.solver import BatchSearch, solve_batch
 
 BATCH = Path(__file__).parent / "batch.py"
 WORLDS = {
-    "streets": lambda: manhattan(120, 3),
-    "trees": lambda: city_trees(60, 3),
-    "sphere": lambda: sphere(120, 3, spiral=Spiral(20, 6)),
+    "streets": lambda: odometry_of(batches(manhattan(120, 3))),
+    "trees": lambda: odometry_of(batches(city_trees(60, 3))),
+    "sphere": lambda: odometry_of(batches(sphere(120, 3, spiral=Spiral(20, 6)))),
+    "bundle": lambda: bundle(40, 3),
 }
+
+
+def odometry_of(steps: Iterable[Batch]) -> Batch:
+    return batch.composed(merged([*steps]))
 
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_all_solvers_come_to_the_same_optimum_however_often(world: str) -> None:
-    graph = batch.composed(merged(step.batch for step in WORLDS[world]()))
+    graph = WORLDS[world]()
     ends: dict[str, float] = {}
     for solver in BATCH_SOLVERS:
         prepared = solver.prepare(graph)
@@ -35,6 +48,38 @@ def test_all_solvers_come_to_the_same_optimum_however_often(world: str) -> None:
             assert chi2_at_end(graph, end) == pytest.approx(ends[solver.name], rel=1e-9)
     assert min(ends.values()) == pytest.approx(ends[OURS], rel=1e-6)
     assert max(ends.values()) <= batch._THERE * ends[OURS]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_on_a_torus_of_noisy_rotations_odometry_leads_to_the_optimum_that_the_truth_leads_to(seed: int) -> None:
+    graph, truth = odometry_of(torus(600, seed, batch._NOISY)), on_torus(np.arange(600))
+    true = [group._replace(values=truth[group.keys - POSE]) for group in graph.variables]
+    best = solve_batch(true, graph.factors, BatchSearch("values", polish=False))
+    found = BATCH_SOLVERS[0].prepare(graph).run()
+    assert BATCH_SOLVERS[0].name == OURS
+    assert chi2_at_end(graph, found) == pytest.approx(best.chi2, rel=1e-8)
+
+
+def test_a_bundle_is_what_it_is_said_to_be() -> None:
+    graph = bundle(40, 7)
+    held, free, points = graph.variables
+    assert (held.fixed, len(held.keys), len(free.keys)) == (True, 2, 38)
+    found = solve_batch(graph.variables, graph.factors, BatchSearch("values"))
+    count = graph.factor_count
+    freedom = 2 * count - 6 * len(free.keys) - 3 * len(points.keys)
+    assert found.converged
+    assert abs(found.chi2 - freedom) < 5.0 * np.sqrt(2.0 * freedom)
+    seen = np.unique(graph.factors[0].keys[:, 1], return_counts=True)[1]
+    assert seen.min() >= 3
+
+
+def test_a_lens_with_distortion_is_none_of_the_peers() -> None:
+    graph = bundle(20, 7)
+    graph.factors[0].measured[:, 7] = 0.01
+    for solver in BATCH_SOLVERS:
+        if not solver.name.startswith(OURS):
+            with pytest.raises(Failed, match="one without distortion"):
+                solver.prepare(graph)
 
 
 def row(solver: str, cpu_s: float, chi2: float = 10.0, status: str = "done") -> dict[str, Any]:

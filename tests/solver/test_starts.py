@@ -14,7 +14,7 @@ from naive.random_others import other_steps
 from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import Spiral, manhattan, sphere
-from factorbus.solver import Group, Options, Solver, errors, solve_batch
+from factorbus.solver import BatchSearch, Group, Options, Solver, errors, solve_batch
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.model import layout as at
@@ -372,3 +372,28 @@ def test_on_data_sets_the_start_is_as_good_as_gtsams(datasets: Path, name: str) 
     theirs, ours = gtsam_chordal(whole(read(datasets / f"{name}.g2o").steps()))
     print(f"{name}: χ² {ours:.6g} at our start, {theirs:.6g} at GTSAM's")
     assert ours <= 1.05 * theirs
+
+
+def test_pixels_alone_make_no_start_by_rotations() -> None:
+    """Cameras that nothing but pixels joins have no rotations to be averaged: what is given is the start there is."""
+    lens = (1.0, 400.0, 400.0, 320.0, 240.0, *[0.0] * 6)
+    points = np.array([[-1.0, -1.0, 4.0], [1.0, -1.0, 5.0], [-1.0, 1.0, 6.0], [1.0, 1.0, 4.5], [0.0, 0.5, 5.5]])
+    cameras = np.array([[0.0, 0, 0, 0, 0, 0, 1], [0.5, 0, 0, 0, 0, 0, 1], [0.0, 0.5, 0, 0, 0, 0, 1]])
+    ends = np.array([[x, 10 + p] for x in range(3) for p in range(5)])
+    u = points[ends[:, 1] - 10] - cameras[ends[:, 0], :3]
+    pixels = 400.0 * u[:, :2] / u[:, 2:] + (320.0, 240.0)
+    seen = Factors("point_seen", ends, np.hstack([pixels, np.tile(lens, (15, 1))]), np.tile([1.0, 0.0, 1.0], (15, 1)))
+    variables = (
+        Variables("se3", np.array([0, 1]), cameras[:2], True),
+        Variables("se3", np.array([2]), cameras[2:] + [[0.05, 0.02, 0.01, 0, 0, 0, 0]]),
+        Variables("point3", 10 + np.arange(5), points + 0.05),
+    )
+    graph = FactorGraph()
+    admit(graph, Batch(variables, (seen,)))
+    assert averaged(graph) == []
+    found = solve_batch(variables, (seen,))
+    assert (found.start, found.chi2) == ("values", pytest.approx(0.0, abs=1e-12))
+    with pytest.raises(errors.BadOption):
+        solve_batch(variables, (seen,), BatchSearch("rotations"))
+    prior = Factors("prior_se3", np.array([[2]]), cameras[2:], np.tile(np.eye(6)[np.triu_indices(6)], (1, 1)))
+    assert solve_batch(variables, (seen, prior), BatchSearch("rotations")).chi2 == pytest.approx(0.0, abs=1e-12)

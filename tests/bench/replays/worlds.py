@@ -67,9 +67,12 @@ def few_landmarks(poses: int, seed: int) -> Iterator[Batch]:
 
 
 def torus(poses: int, seed: int, sigmas: F64 = _IN_SPACE) -> Iterator[Batch]:
-    """Each pose knows the one before and the one a turn earlier; some the one of the lap before."""
+    """Each pose knows the one before and the one a turn earlier; some the one of the lap before.
+
+    sigmas (6,): of relative poses, metres and the vector part of a quaternion.
+    """
     rng, lap = np.random.default_rng([seed, 6]), _RING * _RINGS
-    truth = _on_torus(np.arange(poses))
+    truth = on_torus(np.arange(poses))
     for n in range(poses):
         others = [n - 1] * (n > 0) + [n - _RING] * (n >= _RING) + [n - lap] * (n >= lap and rng.random() < _AGAIN)
         factors = ()
@@ -104,18 +107,19 @@ def robots(poses: int, seed: int) -> Iterator[Batch]:
         yield Batch((_pose("se2", n, truth),), tuple(_together(factors)))
 
 
-def _batches(steps: Iterator[Step]) -> Iterator[Batch]:
+def batches(steps: Iterator[Step]) -> Iterator[Batch]:
+    """What a robot would insert at each step."""
     return (step.batch for step in steps)
 
 
 _DENSE = LoopClosures(share=1.0, most=4, radius_m=3.0, gap=3)
 WORLDS: Mapping[str, Callable[[int, int], Iterator[Batch]]] = {
-    "manhattan": lambda poses, seed: _batches(manhattan(poses, seed)),
-    "noisy_streets": lambda poses, seed: _batches(manhattan(poses, seed, sigma_xy_m=0.1, sigma_theta_rad=0.03)),
-    "city_trees": lambda poses, seed: _batches(city_trees(poses, seed)),
+    "manhattan": lambda poses, seed: batches(manhattan(poses, seed)),
+    "noisy_streets": lambda poses, seed: batches(manhattan(poses, seed, sigma_xy_m=0.1, sigma_theta_rad=0.03)),
+    "city_trees": lambda poses, seed: batches(city_trees(poses, seed)),
     "few_landmarks": few_landmarks,
-    "office": lambda poses, seed: _batches(manhattan(poses, seed, block_m=3, loops=_DENSE)),
-    "sphere": lambda poses, seed: _batches(sphere(poses, seed, spiral=Spiral(ring=40, rings=25))),
+    "office": lambda poses, seed: batches(manhattan(poses, seed, block_m=3, loops=_DENSE)),
+    "sphere": lambda poses, seed: batches(sphere(poses, seed, spiral=Spiral(ring=40, rings=25))),
     "torus": torus,
     "robots": robots,
 }
@@ -152,7 +156,7 @@ def _curve(poses: int, phase: float) -> F64:
     return np.concatenate([xy[:-1], np.arctan2(dy, dx)[:, None]], axis=1)
 
 
-def _on_torus(numbers: I64) -> F64:
+def on_torus(numbers: I64) -> F64:
     """(n, 7): x along the turn, z away from the tube."""
     around, along = 2.0 * np.pi * numbers / _RING, 2.0 * np.pi * numbers / (_RING * _RINGS)
     far = _MAJOR_M + _MINOR_M * np.cos(around)
