@@ -11,7 +11,7 @@ from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
 
 def ring(cameras: int, per_camera: int, seen: int, split: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """dims, rows, cols of Λ of cameras on `split` rings; each sees points, and each point is seen by `seen` in a row."""
+    """dims, rows, cols of Λ of cameras on `split` rings; each has points, which `seen` in a row see."""
     points, each = cameras * per_camera, cameras // split
     at = np.arange(points) // per_camera
     by = (at[:, None] % each + np.arange(seen)) % each + each * (at // each)[:, None]

@@ -13,9 +13,10 @@ from factorbus.solver.sparse.child_order import with_few_waiting
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
-# METIS takes some 5 µs for each variable, in which a core makes 2.5e5 operations of an elimination, and saves three
-# quarters of them in large graphs: it is asked where all eliminations together have more than this for each variable.
-_WORTH_ASKING = 3.3e5
+# METIS takes some 2 µs for each block of a pose graph's Λ, in which a core makes 8e4 operations of an elimination, and
+# saves three quarters of them in large graphs: it is asked where all eliminations together have more than this for each
+# block.  Not by variables: of cameras and points there are tens of blocks to each, and METIS saves nothing there.
+_WORTH_ASKING = 1.1e5
 
 
 def analyze_whole(dims: I64, rows: I64, cols: I64, times: int = 1) -> Symbolic:
@@ -25,7 +26,7 @@ def analyze_whole(dims: I64, rows: I64, cols: I64, times: int = 1) -> Symbolic:
     about.  Raises ValueError as `analyze`.
     """
     symbolic = analyze(dims, rows, cols, order(dims, rows, cols))
-    if times * symbolic.flops <= _WORTH_ASKING * len(dims) or find_spec("pymetis") is None:
+    if times * symbolic.flops <= _WORTH_ASKING * len(rows) or find_spec("pymetis") is None:
         return with_few_waiting(symbolic, rows, cols)
     dissected = analyze(dims, rows, cols, dissect(dims, rows, cols))
     return with_few_waiting(dissected if dissected.flops < symbolic.flops else symbolic, rows, cols)
