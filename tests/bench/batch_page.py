@@ -6,9 +6,10 @@ from typing import Any
 from bench.batch_solvers import BATCH_SOLVERS, OURS, OURS_ALONE
 
 ELSEWHERE = 1.01  # an end above this, in χ² of the lowest, is no optimum: its time says nothing
-_WORDS = """CPU time of a whole graph, from the values of its file, from composed odometry, or from values given with a world,
-to convergence: GTSAM's Levenberg-Marquardt and Gauss-Newton (multifrontal Cholesky), g2o's (Eigen's sparse Cholesky), all in one process, in
-turn, with the same values in memory; ordering is on the clock, reading files is not. *This start*: factorbus from
+_WORDS = """CPU time of a whole graph, from the values of its file, from composed odometry or from values that a world
+comes with (given), to convergence: GTSAM's Levenberg-Marquardt and Gauss-Newton (multifrontal Cholesky), g2o's (Eigen's
+sparse Cholesky, with points marginalized in `bundle`), all in one process, in turn, with the same values in memory;
+ordering is on the clock, reading files is not. *This start*: factorbus from
 where the others begin, and in brackets how many times that they take. *Best of three starts* is what `factorbus solve`
 does: it also tries composed odometry and averaged rotations, and takes the best. Who ends elsewhere, more than 1 %
 above the lowest χ² that any found, is shown with how many times as much."""

@@ -19,7 +19,8 @@ from factorbus.solver import BatchSearch, chi2_at, solve_batch
 
 _TOLERANCE = 1e-6  # of GTSAM and g2o: the relative decrease below which they stop; ours stops at 1e-11, predicted
 _MOST = 200
-_RIGID = 1e-6  # metres and radians of GTSAM's priors where several variables are held, so that measurements pull at them
+# Metres and radians of GTSAM's priors where several variables are held, so that measurements pull at them.
+_RIGID = 1e-6
 
 
 @dataclass(frozen=True, slots=True)

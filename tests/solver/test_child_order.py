@@ -1,4 +1,4 @@
-"""Subtrees in the order by which few update matrices wait: the same R in less memory, where points come before poses."""
+"""Subtrees in the order by which few update matrices wait: the same R in less memory, if points come before poses."""
 
 import numpy as np
 
@@ -16,7 +16,8 @@ def ring(cameras: int, per_camera: int, seen: int, split: int = 1) -> tuple[np.n
     at = np.arange(points) // per_camera
     by = (at[:, None] % each + np.arange(seen)) % each + each * (at // each)[:, None]
     both = np.arange(cameras + points)
-    rows, cols = np.concatenate([both, by.ravel()]), np.concatenate([both, np.repeat(cameras + np.arange(points), seen)])
+    seen_by = np.repeat(cameras + np.arange(points), seen)
+    rows, cols = np.concatenate([both, by.ravel()]), np.concatenate([both, seen_by])
     return np.where(both < cameras, 6, 3), rows, cols
 
 

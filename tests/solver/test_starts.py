@@ -385,7 +385,7 @@ def test_pixels_alone_make_no_start_by_rotations() -> None:
     seen = Factors("point_seen", ends, np.hstack([pixels, np.tile(lens, (15, 1))]), np.tile([1.0, 0.0, 1.0], (15, 1)))
     variables = (
         Variables("se3", np.array([0, 1]), cameras[:2], True),
-        Variables("se3", np.array([2]), cameras[2:] + [[0.05, 0.02, 0.01, 0, 0, 0, 0]]),
+        Variables("se3", np.array([2]), cameras[2:] + np.array([0.05, 0.02, 0.01, 0, 0, 0, 0])),
         Variables("point3", 10 + np.arange(5), points + 0.05),
     )
     graph = FactorGraph()
