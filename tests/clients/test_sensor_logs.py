@@ -90,6 +90,14 @@ def test_geodetic_is_enu_backwards(place: tuple[float, float, float]) -> None:
     np.testing.assert_allclose(enu(geodetic(place, ORIGIN), ORIGIN), place, atol=1e-6)
 
 
+@pytest.mark.parametrize("origin", [(47.0, 359.99, 0.0), (47.0, -359.99, 0.0), (89.99, 10.0, 0.0), (-90.0, 0.0, 0.0)])
+@pytest.mark.parametrize("place", [(5000.0, 0.0, 3.0), (-5000.0, 200.0, 0.0), (0.0, 5000.0, 0.0)])
+def test_a_place_beyond_a_full_turn_or_a_pole_is_named_as_it_is_taken(
+    origin: tuple[float, ...], place: tuple[float, ...]
+) -> None:
+    np.testing.assert_allclose(enu(geodetic(place, origin), origin), place, atol=1e-6)
+
+
 def test_replay_says_what_it_took_and_how_far_it_is_from_the_truth(
     drive: tuple[Path, InertialWorld], capsys: pytest.CaptureFixture[str]
 ) -> None:

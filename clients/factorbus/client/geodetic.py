@@ -9,6 +9,8 @@ are coordinates that turn with the Earth (ECEF), and east, north and up of (φ�
     R = [ −sin λ₀  cos λ₀  0 ;  −sin φ₀ cos λ₀  −sin φ₀ sin λ₀  cos φ₀ ;  cos φ₀ cos λ₀  cos φ₀ sin λ₀  sin φ₀ ]   (2)
 """
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -50,7 +52,18 @@ def geodetic(east_north_up: ArrayLike, origin: ArrayLike) -> F64:
         place[0] += np.degrees(left[1] / (meridian + place[2]))
         place[1] += np.degrees(left[0] / ((N + place[2]) * np.cos(np.radians(place[0]))))
         place[2] += left[2]
-    return place
+    return _named(place)
+
+
+def _named(place: F64) -> F64:
+    """The same place by angles that `enu` takes: beyond a pole by the meridian there, beyond a full turn from -180 to
+    180."""
+    latitude, longitude = math.remainder(place[0], 360.0), place[1]
+    if abs(latitude) > 90.0:
+        latitude, longitude = math.copysign(180.0, latitude) - latitude, longitude + 180.0
+    if abs(longitude) > MOST_LONGITUDE:
+        longitude = math.remainder(longitude, 360.0)
+    return np.array([latitude, longitude, place[2]])
 
 
 def ecef(place: ArrayLike) -> F64:
