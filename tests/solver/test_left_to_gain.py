@@ -2,7 +2,9 @@
 
 import math
 
+import numpy as np
 import pytest
+from naive.random_graphs import camera_steps
 from naive.solver_parts import tree_of
 from solver.test_converged import put
 
@@ -129,3 +131,23 @@ def test_a_step_with_nothing_new_does_not_rest_beside_a_saddle_point() -> None:
     assert report.chi2 == pytest.approx(BEST, rel=1e-2)
     assert report.converged
     assert not solver.unfinished
+
+
+def test_a_step_that_came_to_its_limit_by_steps_that_gain_does_not_rest() -> None:
+    """A drive of cameras that ran off to a χ² of 10²⁰ comes back ten steps at a time: each time R of the tree, whose
+    pivots were raised, said that nothing was left, and the map rested at 9 times its optimum."""
+    chance = np.random.default_rng([494, 5])
+    noise, steps = 10.0 ** chance.uniform(-2, 0.3), int(chance.integers(3, 16))
+    solver, optimum = Solver(), 2.759602
+    for batch in camera_steps(494, steps, noise, "huber"):
+        solver.stage(batch)
+        report = solver.step()
+    rests = 0
+    for _ in range(40):
+        report = solver.step()
+        assert not report.converged or report.chi2 <= 1.001 * optimum
+        rests = rests + 1 if report.converged and not solver.unfinished else 0
+        if rests == 3:
+            break
+    assert rests == 3
+    assert report.chi2 == pytest.approx(optimum, rel=1e-6)

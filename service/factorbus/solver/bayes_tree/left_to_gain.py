@@ -45,8 +45,11 @@ def judge_batch(tree: CliqueTree, result: Minimization, share: float, last: floa
         result.converged = False
     elif not result.converged and math.isfinite(last):
         # Where a valley is curved damped steps are short and many: what a whole one would gain tells whether
-        # there is anything left, and the map rests where they hardly gain.
-        result.converged = not is_left(tree, SLOW * share)
+        # there is anything left, and the map rests where they hardly gain.  Undamped ones that came to their limit tell
+        # it themselves: R of the tree may have lost what is left.
+        most = SLOW * share * (max(chi2, 0.0) + LEAST_CHI2)
+        goes_on = math.isfinite(result.left) and result.left > most
+        result.converged = not goes_on and not is_left(tree, SLOW * share)
     elif result.converged and chi2 < (1.0 - _ROUNDING) * result.chi2:
         # Beside a saddle point a step that gains nothing leads to where much is left.
         result.converged = not is_left(tree, share)
