@@ -47,7 +47,8 @@ class Tuning:
     chi2_epsilon                  a χ² below this is nothing: 1e-12 is a millionth of a standard deviation, squared.  A
                                   step whose new factors add less solves nothing, and no step goes on for less
     max_nonmonotone_steps         where an undamped step would raise χ², it and more may, until χ² is lower than before:
-                                  this many in all.  Else they are taken back, and damping follows.  0: damped at once
+                                  this many in all.  Else they are taken back, and a step of Newton's or damping
+                                  follows.  0: damped at once
     converge_tolerance            `Options.batch_tolerance` of a step that is to converge,
     converge_max_iterations       and its `Options.max_iterations`
 

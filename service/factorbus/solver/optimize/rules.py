@@ -11,7 +11,7 @@ def ordinary_rule(options: Options, tolerance: float) -> StoppingRule:
     """Of a step with something new."""
     return StoppingRule(
         tolerance, options.tuning.chi2_epsilon, options.max_iterations,
-        nonmonotone=options.tuning.max_nonmonotone_steps, newton=True,
+        nonmonotone=options.tuning.max_nonmonotone_steps, newton=options.tuning.max_nonmonotone_steps > 0,
     )  # fmt: skip
 
 
@@ -25,5 +25,5 @@ def settling_rule(options: Options) -> StoppingRule:
     tuning = options.tuning
     return StoppingRule(
         tuning.converge_tolerance, 1e-8 * tuning.chi2_epsilon, tuning.converge_max_iterations, polish=_POLISH,
-        nonmonotone=tuning.max_nonmonotone_steps, newton=True,
+        nonmonotone=tuning.max_nonmonotone_steps, newton=tuning.max_nonmonotone_steps > 0,
     )  # fmt: skip
