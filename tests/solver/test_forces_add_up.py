@@ -44,7 +44,7 @@ def test_where_forces_of_a_camera_add_up_a_step_has_converged_where_it_says_so(
         solver.stage(batch)
         report = solver.step()
         assert n < at_step or not report.converged or is_there(solver, report.chi2)
-    for _ in range(20):
+    for _ in range(60):
         report = solver.step()
     assert report.converged
     assert is_there(solver, report.chi2)

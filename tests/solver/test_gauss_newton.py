@@ -183,6 +183,7 @@ def test_far_from_the_end_there_are_none_however_little_steps_gain() -> None:
     assert not rule.is_slow(decrease=1e-8, last=1e-5, chi2=1.0)
     assert rule.is_slow(decrease=1e-5, last=2e-5, chi2=1.0)
     assert rule.is_slow(decrease=2e-5, last=1e-5, chi2=1.0)
+    assert not rule.is_slow(decrease=1e-300, last=1e300, chi2=1e-290)
 
 
 def test_where_undamped_steps_lead_down_there_are_none_of_newtons() -> None:

@@ -20,6 +20,7 @@ _HALVES = 3  # of a step of Newton's
 # Steps that gain less than this share of χ² are near the end; as many of Gauss-Newton's take the time of one of
 # Newton's.
 _NEAR, _MANY = 1e-3, 12
+_LEAST_NORMAL = 2.0**-1022
 # Below these δ, too, is rounding: a settled map that is settled again does not move.
 _EXACT, _EXACT_FLOOR = 1e-21, 1e-24
 
@@ -96,10 +97,10 @@ class StoppingRule:
 
     def is_slow(self, decrease: float, last: float, chi2: float) -> bool:
         """Whether steps that gain this, and `last` before, have some way to go to where one is negligible."""
-        if not decrease <= _NEAR * chi2 or not math.isfinite(last):
+        if not 0.0 < decrease <= _NEAR * chi2 or not math.isfinite(last):
             return False
-        left = decrease / (self.tolerance * chi2 + self.floor)
-        return decrease >= last or left > (last / decrease) ** _MANY
+        left = decrease / max(self.tolerance * chi2 + self.floor, _LEAST_NORMAL)
+        return decrease >= last or math.log(left) > _MANY * math.log(last / decrease)
 
 
 @dataclass(slots=True)

@@ -25,9 +25,8 @@ class Elimination:
 
     NOT_KEPT = ("_options",)
 
-    def __init__(self, options: Options, whole: bool = False) -> None:
-        """whole: of a graph that is eliminated as a whole, and not step by step; see `analyze_whole`."""
-        self._options, self._whole = options, whole
+    def __init__(self, options: Options) -> None:
+        self._options = options
         self._cholesky = Cholesky()
         self._pattern = (0, 0)
         self.symbolic: Symbolic | None = None
@@ -75,24 +74,27 @@ class Elimination:
         pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
         if self.symbolic is None or pattern != self._pattern:
             dims = graph.dims[: pattern[0]]
-            if self._whole:
-                self.symbolic, self._pattern = analyze_whole(dims, blocks.rows, blocks.cols, _TIMES), pattern
-                watch.lap("symbolic")
-                return self.symbolic
-            group = (
-                constraint(graph, self._options.tuning.constrain_recent_poses)
-                if self._options.tuning.constrain_last_pose
-                else None
-            )
-            perm = order(dims, blocks.rows, blocks.cols, group)
-            watch.lap("order")
-            self.symbolic, self._pattern = analyze(dims, blocks.rows, blocks.cols, perm), pattern
+            self.symbolic, self._pattern = self._analyzed(graph, dims, blocks, watch), pattern
             watch.lap("symbolic")
         return self.symbolic
+
+    def _analyzed(self, graph: FactorGraph, dims: I64, blocks: HessianBlocks, watch: Stopwatch) -> Symbolic:
+        tuning = self._options.tuning
+        group = constraint(graph, tuning.constrain_recent_poses) if tuning.constrain_last_pose else None
+        perm = order(dims, blocks.rows, blocks.cols, group)
+        watch.lap("order")
+        return analyze(dims, blocks.rows, blocks.cols, perm)
 
     def forget(self) -> None:
         """The pattern was changed in a way that its size does not show."""
         self.symbolic = None
+
+
+class WholeElimination(Elimination):
+    """Of a graph that is eliminated as a whole, and not step by step: in whichever order takes least."""
+
+    def _analyzed(self, graph: FactorGraph, dims: I64, blocks: HessianBlocks, watch: Stopwatch) -> Symbolic:
+        return analyze_whole(dims, blocks.rows, blocks.cols, _TIMES)
 
 
 def constraint(graph: FactorGraph, recent_poses: int = 1) -> I64:

@@ -19,7 +19,7 @@ from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
-from factorbus.solver.sparse.elimination import Elimination
+from factorbus.solver.sparse.elimination import WholeElimination
 from factorbus.solver.sparse.symbolic import Symbolic
 from factorbus.solver.starts.same_place import SamePlace
 from factorbus.solver.starts.search import ROTATIONS, STARTS, BatchEvents, BatchSearch, NoEvents
@@ -86,7 +86,7 @@ class Descents:
         self._search, self._events = search, events
         self.graph, none = graph, (0,) * at.COUNTS
         self.are_close = SamePlace(graph)
-        self._system = System(graph, Incremental(Elimination(options, whole=True), options))
+        self._system = System(graph, Incremental(WholeElimination(options), options))
         self._suspects = find_undetermined(graph, none)
         if self._suspects.size and (free := find_unanchored(graph, none)) >= 0:
             raise self._system.underconstrained(
