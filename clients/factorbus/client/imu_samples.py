@@ -19,7 +19,7 @@ _STANDARD = 9.80665  # m/s²
 # free fall, where there is still less.
 _IN_G = 0.5, 1.6
 _LARGEST = 40.0 * _STANDARD  # m/s², a median of it: beyond what sensors measure, unless it is mm/s² or thousandths of g
-# A sample that lasts longer, seconds, or so many of which each lasts longer than the one before: times, not durations.
+# A sample that lasts longer, seconds, or this number of which each lasts longer than the one before: times.
 _LONGEST_S, _IN_A_ROW = 60.0, 8
 _FASTEST = 70.0  # rad/s, 4,000 °/s: the widest range of gyroscopes
 
