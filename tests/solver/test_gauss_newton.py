@@ -19,7 +19,7 @@ class Curve:
         self.chi2s = [self.chi2(self.x)]
         self.factorized: list[float] = []
         self.taken_back: list[np.ndarray] = []
-        self.newtons = 0
+        self.newtons = self.asked = 0
 
     def chi2(self, x: np.ndarray) -> float:
         return float(self.r(x) @ self.r(x))
@@ -38,6 +38,12 @@ class Curve:
 
     def step(self) -> np.ndarray:
         return self.delta
+
+    def present_decrease(self, certain: float) -> float:
+        """By A of the present point, whatever was factorized: nothing is left."""
+        J, eta = self.J(self.x), self.gradient(self.x)
+        self.asked += 1
+        return float(eta @ np.linalg.solve(J.T @ J, eta))
 
     def newton_step(self) -> np.ndarray:
         """By the Hessian of χ² / 2, which is differences of its gradient."""
@@ -200,6 +206,18 @@ def test_damped_steps_follow_the_first_of_newtons_that_does_not_lead_down() -> N
     assert abs(problem.x[0]) < 1e-9
     assert problem.newtons == 1
     assert problem.factorized[:2] == [0.0, 0.5]
+
+
+@pytest.mark.parametrize(("certain", "iterations", "asked"), [(np.inf, 1, 0), (1e-7, 1, 0), (1e-9, 2, 2)])
+def test_what_an_old_factor_says_is_left_is_computed_at_the_present_point(
+    certain: float, iterations: int, asked: int
+) -> None:
+    """J of x² halves with every step, so an old factor says that a quarter of what is left is left."""
+    problem = Curve(lambda x: np.array([1.0, 0.3 * x[0] ** 2]), lambda x: np.array([[0.0], [0.6 * x[0]]]), [0.09])
+    result = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(2e-7, 0.0, limit=10, certain=certain))
+    assert (result.converged, result.iterations, problem.asked) == (True, iterations, asked)
+    left = problem.present_decrease(0.0)
+    assert result.left == pytest.approx(left if asked else 0.25 * left)
 
 
 def test_what_another_step_would_take_off_is_told() -> None:

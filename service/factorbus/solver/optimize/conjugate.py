@@ -31,8 +31,10 @@ def iterate(
     precondition: Callable[[F64], tuple[float, F64]],
     left: float,
     most: int,
+    floor: float = 0.0,
 ) -> tuple[float, F64]:
-    """(δᵀη, δ) with A δ = η, until what is left is no more than a share of what was found; NaN where A has no numbers.
+    """(δᵀη, δ) with A δ = η, until what is left is no more than a share of what was found, or `floor`; NaN where A has
+    no numbers.
 
     multiply: A p.  precondition: gᵀ M⁻¹ g and M⁻¹ g.  Where the curvature pᵀ A p is not positive δ is what was found
     before; 0 and zeros where that is nothing.
@@ -54,7 +56,7 @@ def iterate(
         found += size * square
         before = square
         square, z = precondition(g)
-        if not square > left * found:
+        if not square > left * found + floor:
             break
         p = z + square / before * p
     return found, x

@@ -40,6 +40,11 @@ class LeastSquares(Protocol):
         """The δ of the last `decrease`."""
         ...
 
+    def present_decrease(self, certain: float) -> float:
+        """δᵀη, as `decrease`, with Λ of the present point, until the factor made last, which is that of another, says
+        that no more than `certain` is left."""
+        ...
+
     def newton_step(self) -> F64 | None:
         """δ by the Hessian of χ², terms of second order included, where R is that of an undamped Λ; None: it has none
         to give."""
@@ -66,8 +71,12 @@ class LinearizedLeastSquares(LeastSquares, Protocol):
     """A problem that can stay linearized where it was."""
 
     def accept_linear(self) -> float:
-        """Move to the point linearized last, but keep the linear model, whose gradient is zero there.  Return what the
-        true gradient there, with the old factor, says that another step would take off χ²."""
+        """Move to the point linearized last, but keep the linear model.  Return what the true gradient there, with the
+        old factor, says that another step would take off χ²."""
+        ...
+
+    def rest(self) -> None:
+        """The gradient is that of the linear model from here on, which is zero."""
         ...
 
 
@@ -81,6 +90,8 @@ class StoppingRule:
     than before them: at most this many in all.  If it never is, they are taken back, and damped ones follow.
     newton: where an undamped step would raise χ², one of Newton's is tried before damped ones; and where undamped ones
     near the end gain hardly less than the one before; until one of Newton's would raise χ².
+    certain: what an old factor says is left is computed with Λ of the present point where it is more than this share
+    of χ².
     """
 
     tolerance: float
@@ -90,6 +101,7 @@ class StoppingRule:
     polish: int = 0
     nonmonotone: int = 0
     newton: bool = False
+    certain: float = math.inf
 
     def is_negligible(self, decrease: float, chi2: float) -> bool:
         """Whether a decrease of χ² is not worth a step.  False for NaN."""
@@ -159,8 +171,11 @@ def minimize(
         undamped = result.damping == 0.0
         result.left = decrease if undamped else math.inf
         if undamped and rule.is_negligible(decrease, result.chi2):
-            result.converged = True
-            break
+            result.converged = fresh or _is_certain(problem, result, rule)
+            if result.converged:
+                break
+            solved = False
+            continue
         if undamped and fresh:
             if newton and rule.is_slow(decrease, last, result.chi2):
                 newton = _try_newton(problem, result)
@@ -213,7 +228,12 @@ def minimize(
             solved = decrease <= rule.reuse * gained or rule.is_negligible(decrease, reached)
     else:
         # The last try may have been all that was needed.
-        result.converged = result.damping == 0.0 and solved and rule.is_negligible(decrease, result.chi2)
+        result.converged = (
+            result.damping == 0.0
+            and solved
+            and rule.is_negligible(decrease, result.chi2)
+            and _is_certain(problem, result, rule)
+        )
     if result.converged and result.damping == 0.0 and rule.polish:
         _polish(problem, result, rule.polish)
     return result
@@ -235,8 +255,17 @@ def try_linear_step(problem: LinearizedLeastSquares, chi2: float, rule: Stopping
         return None
     result.left = problem.accept_linear()
     result.chi2, result.iterations = reached, 1
-    result.converged = rule.is_negligible(result.left, reached)
+    result.converged = rule.is_negligible(result.left, reached) and _is_certain(problem, result, rule)
+    problem.rest()
     return result
+
+
+def _is_certain(problem: LeastSquares, result: Minimization, rule: StoppingRule) -> bool:
+    """Whether an undamped step would gain nothing, where the factor that says so is that of another point."""
+    certain = rule.certain * result.chi2 + rule.floor
+    if result.left > certain:
+        result.left = problem.present_decrease(certain)
+    return rule.is_negligible(result.left, result.chi2)
 
 
 def _is_optimum(problem: LeastSquares, result: Minimization, rule: StoppingRule) -> bool:

@@ -5,6 +5,7 @@ from factorbus.solver.optimize.gauss_newton import StoppingRule
 from factorbus.solver.options import Options
 
 _POLISH = 100
+_CERTAIN = 1e-3  # of what `converged` promises: the R of an older point may be wrong by the rest
 
 
 def ordinary_rule(options: Options, tolerance: float) -> StoppingRule:
@@ -12,6 +13,7 @@ def ordinary_rule(options: Options, tolerance: float) -> StoppingRule:
     return StoppingRule(
         tolerance, options.tuning.chi2_epsilon, options.max_iterations,
         nonmonotone=options.tuning.max_nonmonotone_steps, newton=options.tuning.max_nonmonotone_steps > 0,
+        certain=_CERTAIN * options.converged_share,
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from factorbus.solver.graph.escaped import are_all_within
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.multiply_hessian import multiply_hessian
 from factorbus.solver.kernels.model.retract import differing, move
 from factorbus.solver.kernels.sparse.partial_cholesky import ROUNDING
 from factorbus.solver.optimize.conjugate import ConjugateGradients, iterate, precondition_by
@@ -102,6 +103,21 @@ class System(Generic[R]):
         """The δ of the last `decrease`."""
         return self._solver.step(self._watch)
 
+    def present_decrease(self, certain: float) -> float:
+        """δᵀη with Λ δ = η, Λ of the present point, by conjugate gradients; R is the preconditioner, and that of
+        another point.  Until no more than `certain` is left by R.  MATH (6.4)"""
+        eta = self.blocks.eta[: self.graph.counts[at.SCALARS]]
+
+        def multiply(p: F64) -> F64:
+            out = np.zeros_like(p)
+            multiply_hessian(self.graph.array_table, p, out)
+            return out
+
+        precondition = partial(precondition_by, self.factor, self._watch)
+        found, _ = iterate(eta, multiply, precondition, 0.0, _NEWTON_ITERATIONS, certain)
+        self.decrease()  # d is that of η again
+        return found
+
     def newton_step(self) -> F64 | None:
         """δ with H δ = η, H the Hessian of χ² with its terms of second order; None where R has lost to rounding.
 
@@ -153,18 +169,20 @@ class System(Generic[R]):
         self.anew()
 
     def accept_linear(self) -> float:
-        """Move to the point linearized last; Λ, R and the linear model stay, whose gradient is zero there.
+        """Move to the point linearized last; Λ, R and the linear model stay.
 
         Return what the true gradient there, with R, says that another step would take off χ².
         """
         self.graph.values, self._trial = self._trial, self.graph.values
         self.blocks.swap_eta()
         self.factor.turned()
-        left = self.decrease()
+        self._have_lambda, self._spare_is_here, self._moved, self.drifted = False, False, True, True
+        return self.decrease()
+
+    def rest(self) -> None:
+        """η is that of the linear model from here on, which is zero."""
         self.blocks.eta[: self.graph.counts[at.SCALARS]] = 0.0
         self._solver.rest()
-        self._have_lambda, self._spare_is_here, self._moved, self.drifted = False, False, True, True
-        return left
 
     def relinearize(self) -> None:
         """Λ and η at the present point, if they are not."""
