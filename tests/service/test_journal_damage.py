@@ -3,6 +3,8 @@
 import random
 import shutil
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -68,6 +70,38 @@ def change(path: Path, at: int, mask: int = 1) -> None:
     data = bytearray(path.read_bytes())
     data[at] ^= mask
     path.write_bytes(data)
+
+
+_TAKES_INDEX = """
+import fcntl, sys
+with open(sys.argv[1], "rb+") as index:
+    try:
+        fcntl.lockf(index, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, 128)  # as SQLite does before it cuts off one that was left
+    except BlockingIOError:
+        sys.exit(9)
+"""
+
+
+def index_is_held(folder: Path) -> bool:
+    """Whether another process sees that somebody has the index of the log open."""
+    return subprocess.run([sys.executable, "-c", _TAKES_INDEX, str(folder / INDEX)], check=False).returncode == 9
+
+
+def test_who_reads_it_beside_who_writes_it_takes_no_locks_from_the_writer(tmp_path: Path) -> None:
+    """A service reads the journal that it writes, for a fork or a replica, say; other processes may open it then."""
+    folder = tmp_path / "m"
+    made = create(folder, "m", "bayes-tree", OPTIONS, 77, "commit")
+    made.append([record(1)])
+    assert index_is_held(folder)
+    for _ in range(2):
+        other = open_store(folder, read_only=True)
+        assert index_is_held(folder)
+        other.close()
+        assert index_is_held(folder)
+    made.append([record(2)])
+    made.close()
+    assert not index_is_held(folder)
+    assert content(folder)[2] == [record(1), record(2)]
 
 
 @pytest.mark.parametrize("at", [0, 5, 17, 24, 31, 32, 36, 40, 50, 60, 20 * FRAME, 30 * FRAME + 777])

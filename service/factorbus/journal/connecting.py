@@ -5,6 +5,7 @@ import sqlite3
 from pathlib import Path
 
 from factorbus.journal.log_frames import lost_from
+from factorbus.journal.own_connections import OwnConnection, alone_to_connect
 from factorbus.journal.problems import JournalDamaged, JournalUnreadable, JournalVersion
 
 # 2: the answer to what was accepted was not kept whole; 3: its header had no seal; 4: a checkpoint counted only for the
@@ -26,7 +27,13 @@ _OF_THE_DISK = (
 
 def connected(path: Path, durability: str, read_only: bool) -> tuple[sqlite3.Connection, bool]:
     """A connection, and whether it can write.  Raises JournalDamaged, JournalVersion, JournalUnreadable."""
-    _check_log(path)
+    with alone_to_connect(path) as alone:
+        if alone:
+            _check_log(path)
+        return _connected(path, durability, read_only)
+
+
+def _connected(path: Path, durability: str, read_only: bool) -> tuple[sqlite3.Connection, bool]:
     why = ""
     for way in _WAYS_TO_READ if read_only else ("rw", *_WAYS_TO_READ):
         if way == _AS_IT_IS and _has_log(path):
@@ -48,8 +55,9 @@ def connected(path: Path, durability: str, read_only: bool) -> tuple[sqlite3.Con
 def connection_to(path: Path, mode: str, durability: str) -> sqlite3.Connection:
     """A connection in one of SQLite's modes, or `rwc` for a database that is still empty.  Raises what SQLite does."""
     connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, check_same_thread=False, timeout=10.0
-    )
+        f"{path.absolute().as_uri()}?mode={mode}",
+        uri=True, isolation_level=None, check_same_thread=False, timeout=10.0, factory=OwnConnection,
+    ).known_as(path)  # fmt: skip
     try:
         if mode in ("rw", "rwc"):
             connection.execute("PRAGMA journal_mode = WAL")
@@ -71,7 +79,10 @@ def what_reading_failed_with(path: Path, error: Exception) -> JournalDamaged | J
 
 
 def _check_log(path: Path) -> None:
-    """Before SQLite sees it, which would take what is left for all.  Raises JournalDamaged, JournalUnreadable."""
+    """Before SQLite sees it, which would take what is left for all.  Raises JournalDamaged, JournalUnreadable.
+
+    Only where this process has no connection to it, see `own_connections`; then it was looked at before that.
+    """
     try:
         lost = lost_from(path)
     except OSError as error:
