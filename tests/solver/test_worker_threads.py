@@ -15,7 +15,9 @@ from factorbus.simulate import manhattan
 from factorbus.simulate.step import POSE
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.eliminate import (
+from factorbus.solver.kernels.sparse import fronts as fr
+from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
+from factorbus.solver.kernels.sparse.subtrees import (
     ASSEMBLY,
     BOOKKEEPING,
     END,
@@ -24,10 +26,12 @@ from factorbus.solver.kernels.bayes_tree.eliminate import (
     PIECES,
     TURN,
     cut_subtrees,
+    cut_whole,
 )
-from factorbus.solver.kernels.sparse import fronts as fr
-from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
 from factorbus.solver.kernels.sparse.task_queue import MOST
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import Symbolic, analyze
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE, WorkerThread, count_free
 
 pytestmark = pytest.mark.skipif(
@@ -113,6 +117,61 @@ def test_a_whole_map_has_the_same_bits(driven: Solver, count: int) -> None:
         while not any(worker.made for worker in workers):
             assert eliminated(driven) == alone
     assert eliminated(driven) == alone
+
+
+def grid(side: int) -> tuple[Symbolic, np.ndarray, np.ndarray]:
+    """Λ of a grid of points, three numbers each, that hold to their neighbours: its analysis, blocks and offsets."""
+    at, dims = np.arange(side * side).reshape(side, side), np.full(side * side, 3)
+    pairs = np.concatenate(
+        [np.stack((a.ravel(), b.ravel())) for a, b in ((at[1:], at[:-1]), (at[:, 1:], at[:, :-1]))], 1
+    )
+    rows = np.concatenate((at.ravel(), pairs.min(0)))
+    cols = np.concatenate((at.ravel(), pairs.max(0)))
+    data = np.random.default_rng(side).normal(size=(rows.size, 3, 3))
+    data[: at.size] = 30.0 * np.eye(3)
+    symbolic = analyze(dims, rows, cols, order(dims, rows, cols, None))
+    return symbolic, data.ravel(), 9 * np.arange(rows.size)
+
+
+@pytest.fixture(scope="module")
+def plane() -> tuple[Symbolic, np.ndarray, np.ndarray]:
+    return grid(60)
+
+
+@pytest.mark.parametrize("count", [1, 3, MOST])
+def test_a_whole_graph_has_the_same_bits(plane: tuple[Symbolic, np.ndarray, np.ndarray], count: int) -> None:
+    """Subtrees and panels of it, on several cores; and it is R of Λ."""
+    symbolic, data, offsets = plane
+    assert len(cut_whole(symbolic.fronts)) > 1
+    eta = np.random.default_rng(1).normal(size=symbolic.size)
+
+    def solved() -> bytes:
+        cholesky = Cholesky()
+        assert cholesky.factorize(symbolic, data, offsets) == -1
+        return cholesky.solve(eta).tobytes()
+
+    alone = solved()
+    with working(count) as workers:
+        while not any(worker.made for worker in workers):
+            assert solved() == alone
+    cholesky = Cholesky()
+    cholesky.factorize(symbolic, data, offsets)
+    R, places = cholesky.R(), symbolic.scalar_order()
+    np.testing.assert_allclose(R.T @ (R @ np.frombuffer(alone)[places]), eta[places], atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_the_same_pivot_fails_whoever_comes_to_it(count: int) -> None:
+    """Of several, in the order of elimination."""
+    symbolic, data, offsets = grid(60)
+    bad = symbolic.order[[700, 1500, 2900, 3599]]
+    for n in range(len(bad), 0, -1):
+        spoilt = data.copy()
+        for variable in bad[len(bad) - n :]:
+            spoilt[offsets[variable] + 4] = -1.0
+        with working(count):
+            for _ in range(5):
+                assert Cholesky().factorize(symbolic, spoilt, offsets) == bad[len(bad) - n]
 
 
 def test_a_drive_has_the_same_bits() -> None:

@@ -36,6 +36,7 @@ from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.multifrontal import clear_front
 from factorbus.solver.kernels.sparse.partial_cholesky import RAISED, ROUNDING, factor_front
+from factorbus.solver.kernels.sparse.subtrees import END, FAILED, FIRST, FLOPS, SUBTREE, TURN, cut_subtrees
 from factorbus.solver.kernels.sparse.task_queue import (
     AT,
     SUBTREES,
@@ -59,16 +60,6 @@ CUT = 10  # the subtrees, a row each
 N = WIDTH * (CUT + 1)
 MOST_PIVOTS, MOST_SEPARATORS = N + 1, N + 2
 PLAN = MOST_SEPARATORS + 1
-
-# Columns of a subtree, fronts FIRST .. END: when it is eliminated the variable whose pivot failed, or −1, and flops.
-FIRST, END, FAILED, FLOPS = 0, 1, 2, 3
-TURN = 4  # of the row k: the subtree that is eliminated as the k-th one; those that take longest come first
-SUBTREE = 5
-
-PIECES = 3  # for each thread; with more of them more is left above, where there is less to share
-# What a front takes besides the flops of its pivots, in those: to assemble it, by scalars², and as such.  Measured.
-ASSEMBLY, BOOKKEEPING = 150, 80_000
-LONG = 30_000_000  # an elimination that is worth sharing, half a millisecond
 
 
 class SortedIn(NamedTuple):
@@ -156,44 +147,6 @@ def _eliminate_in_pieces(plan: I64, records: I64, workers: int, queue: I64) -> t
         flops += spent + cut[k, FLOPS]
     failed, spent = eliminate_range(plan, f, len(records), 0, queue)
     return failed, flops + spent
-
-
-@part
-def cut_subtrees(records: I64, workers: int) -> I64:
-    """Subtrees of neighbours in postorder that take a small share of the whole; none where it is not worth it."""
-    count = len(records)
-    takes, first = np.zeros(count), np.arange(count)  # with all below
-    total = 0.0
-    for f in range(count):
-        scalars = records[f, fr.PIVOTS] + records[f, fr.SEPARATOR] + 1
-        own = (records[f, fr.PIVOTS] + ASSEMBLY) * scalars * scalars + BOOKKEEPING
-        takes[f] += own
-        total += own
-        above = records[f, fr.PARENT]
-        if above >= 0:
-            takes[above] += takes[f]
-            first[above] = min(first[above], first[f])
-    if total < LONG:
-        return np.empty((0, SUBTREE), np.int64)
-    cut, size, pieces = np.empty((count, SUBTREE), np.int64), np.empty(count), 0
-    most = total / (PIECES * (1 + workers))
-    for f in range(count):
-        above = records[f, fr.PARENT]
-        if takes[f] > most or (above >= 0 and takes[above] <= most):
-            continue
-        if pieces > 0 and cut[pieces - 1, END] == first[f] and size[pieces - 1] + takes[f] <= most:
-            size[pieces - 1] += takes[f]
-        else:
-            cut[pieces, FIRST], size[pieces] = first[f], takes[f]
-            pieces += 1
-        cut[pieces - 1, END] = f + 1
-    for turn in range(pieces):
-        largest = 0
-        for k in range(1, pieces):
-            if size[k] > size[largest]:
-                largest = k
-        cut[turn, TURN], size[largest] = largest, -1.0
-    return cut[:pieces]
 
 
 @part

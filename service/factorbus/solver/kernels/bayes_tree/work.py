@@ -5,8 +5,8 @@ that it takes, as measured: `docs/decisions/budget.md`.
 """
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.eliminate import ASSEMBLY, BOOKKEEPING
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel
+from factorbus.solver.kernels.sparse.subtrees import ASSEMBLY, BOOKKEEPING
 
 ORDERING = 60_000.0  # of each variable that is eliminated: its order, its place in the new fronts
 RELINEARIZING = 40_000.0  # of each variable that is relinearized: its factors

@@ -5,8 +5,10 @@ It has the elimination in it, and to compile that once more would take two secon
 
 from factorbus.solver.kernels.bayes_tree.eliminate import make_subtree
 from factorbus.solver.kernels.jit.compile import I64, part
+from factorbus.solver.kernels.sparse.multifrontal import factorize_subtree
 from factorbus.solver.kernels.sparse.parallel_panels import make_panel_chunk
 from factorbus.solver.kernels.sparse.task_queue import (
+    FRONTS,
     MADE,
     PANEL,
     TASK,
@@ -25,6 +27,8 @@ def run_tasks(queue: I64, worker: int) -> None:
         while chunk >= 0:
             if queue[TASK] == PANEL:
                 make_panel_chunk(queue, chunk)
+            elif queue[TASK] == FRONTS:
+                factorize_subtree(queue, chunk, scratch_of(worker))
             else:
                 make_subtree(queue, chunk, scratch_of(worker))
             queue[worker + MADE] += 1

@@ -10,6 +10,7 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.scratch import take, take_filled
 from factorbus.solver.kernels.sparse import fronts as fr
+from factorbus.solver.kernels.sparse.subtrees import END, FIRST, cut_whole
 
 NONE = -1
 SMALL_PIVOTS, SMALL_ZEROS = 12, 1.0 / 3.0
@@ -212,29 +213,42 @@ def _place(records: I64) -> I64:
     """Give the rows of R and the update matrices their places; gives the doubles of R and of the whole arena.
 
     Update matrices live on two stacks, those of even and of odd depth: when a front is made its children lie on top of
-    the one and it goes on top of the other, so nothing is ever moved.
+    the one and it goes on top of the other, so nothing is ever moved.  Subtrees that other threads may factorize have
+    two stacks of their own, each.
     """
     fronts = records.shape[0]
-    depth = np.zeros(fronts, np.int64)
+    cut = cut_whole(records)
+    stack = np.zeros(fronts, np.int64)
+    for k in range(len(cut)):
+        stack[cut[k, FIRST] : cut[k, END]] = 2 * (k + 1)
     for f in range(fronts - 1, -1, -1):
-        if records[f, fr.PARENT] != NONE:
-            depth[f] = (depth[records[f, fr.PARENT]] + 1) % 2
-    top, peak, end = np.zeros(2, np.int64), np.zeros(2, np.int64), fr.SCRATCH
+        above = records[f, fr.PARENT]
+        if above != NONE:
+            stack[f] += (stack[above] + 1) % 2
+    stacks = 2 * (len(cut) + 1)
+    top, peak, end = np.zeros(stacks, np.int64), np.zeros(stacks, np.int64), fr.SCRATCH
     for f in range(fronts):
         front = records[f]
         p, m = front[fr.PIVOTS], front[fr.SEPARATOR]
         front[fr.LD_ROWS], front[fr.WIDTH_UPDATE] = fr.row_stride(fr.padded_size(p) + m), fr.padded_size(m)
         front[fr.ROWS] = end + fr.padded_size(p) - p
         end += p * front[fr.LD_ROWS]
-        if front[fr.CHILD] != NONE:
-            top[1 - depth[f]] = records[front[fr.CHILD], fr.UPDATE]
-        front[fr.UPDATE] = top[depth[f]]
-        top[depth[f]] += fr.update_size(m, front[fr.WIDTH_UPDATE])
-        peak[depth[f]] = max(peak[depth[f]], top[depth[f]])
+        c = front[fr.CHILD]
+        while c != NONE and stack[c] != stack[f] ^ 1:
+            c = records[c, fr.SIBLING]
+        if c != NONE:
+            top[stack[c]] = records[c, fr.UPDATE]
+        front[fr.UPDATE] = top[stack[f]]
+        top[stack[f]] += fr.update_size(m, front[fr.WIDTH_UPDATE])
+        peak[stack[f]] = max(peak[stack[f]], top[stack[f]])
+    begin = np.empty(stacks + 1, np.int64)
+    begin[0] = end
+    for k in range(stacks):
+        begin[k + 1] = begin[k] + peak[k]
     for f in range(fronts):
-        records[f, fr.UPDATE] += end + (peak[0] if depth[f] == 1 else 0)
+        records[f, fr.UPDATE] += begin[stack[f]]
     sizes = np.empty(2, np.int64)
-    sizes[0], sizes[1] = end, end + peak[0] + peak[1]
+    sizes[0], sizes[1] = end, begin[stacks]
     return sizes
 
 

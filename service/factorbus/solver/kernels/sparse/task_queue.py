@@ -15,7 +15,7 @@ from factorbus.solver.kernels.sparse.fronts import MOST_WORKERS as MOST
 from factorbus.solver.kernels.sparse.fronts import SCRATCH_OF_ONE
 
 # Words of a queue.  Those that several threads change have a cache line each.
-TASK = 0  # PANEL or SUBTREES
+TASK = 0  # PANEL, SUBTREES or FRONTS
 AT = 1  # entry of an array that the task is in, as in a table of arrays
 MORE = 6  # what else is to be said of the task, up to
 CHUNKS = 15
@@ -28,7 +28,7 @@ ABSENT, WORKING, STOPPING = 0, 1, 2
 MADE, SEMAPHORE_AT = 1, 8 - SEMAPHORE
 WORDS = WORKERS + 8 * MOST
 
-PANEL, SUBTREES = 0, 1
+PANEL, SUBTREES, FRONTS = 0, 1, 2
 
 
 @inline_kernel
