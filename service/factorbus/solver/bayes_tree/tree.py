@@ -125,22 +125,26 @@ class CliqueTree(Arenas):
         """The variable whose pivot made the last step fail."""
         return int(self.state[tl.S_FAILED])
 
-    def move_all(self, damped: bool = False) -> None:
-        """The next step moves the linearization points of all variables to the estimate; damped: and damps all pivots,
-        which later ones do, too, until `undamp`.
-        """
+    @property
+    def has_moved(self) -> bool:
+        """Whether the last step moved linearization points: it did not where Λ could not be eliminated at new ones."""
+        return self.state.item(tl.S_RELINEARIZED) > 0
+
+    def move_all(self, damped: int = 0) -> None:
+        """The next step moves the linearization points of all variables to the estimate; damped: 0, or DAMPED, where it
+        damps all pivots, as later ones do."""
         var = self._graph.var[: self.state[tl.S_VARIABLES]]
         free = np.flatnonzero(var[:, at.V_COLUMN] >= 0)
         self.node[free, tl.N_FLAGS] = 1
         self.pending[: free.size] = free
         self.state[tl.S_PENDING] = free.size
         self.state[[tl.S_DUE, tl.S_ONCE]] = 1
-        if self.state[tl.S_RAISED] != tl.DAMPED:
-            self.state[tl.S_RAISED] = tl.DAMPED if damped else 0
+        self.state[tl.S_RAISED] = damped
 
-    def undamp(self) -> None:
-        """The next step, which moves all, damps no pivots."""
-        self.state[tl.S_RAISED] = 0
+    def note_diagonal(self, diagonal: F64) -> None:
+        """The diagonal of Λ at the estimate, where the next step moves all."""
+        self.scalars[1, : diagonal.size] = diagonal
+        self.totals[tl.T_LARGEST_DIAGONAL] = diagonal.max(initial=0.0)
 
     def reset_to_linearization(self) -> None:
         """Put the estimate back to the linearization points: the solution of the linear problem is not taken."""

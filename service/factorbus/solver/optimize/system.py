@@ -202,6 +202,11 @@ class System(Generic[R]):
         self.factor.moved()
         self._have_lambda, self._spare_is_here = True, False
 
+    def diagonal(self) -> F64:
+        """That of Λ at the present point, in insertion order."""
+        self.have_lambda()
+        return self.blocks.data[self.blocks.diagonal(self.graph)]
+
     def anew(self) -> None:
         """Λ and η at the present point: what the factors measure, or weigh, is other than it was."""
         self._have_lambda, self._spare_is_here = False, False
