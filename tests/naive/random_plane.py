@@ -2,7 +2,6 @@
 points that only ranges and bearings see, and weak priors."""
 
 from collections.abc import Iterator
-
 from typing import Any
 
 import numpy as np
