@@ -75,7 +75,7 @@ def numbers(solver: Solver) -> list[bytes]:
     return [np.ascontiguousarray(array).tobytes() for array in arrays]
 
 
-def eliminated(driven: Solver) -> tuple[list[bytes], int]:
+def eliminated(driven: Solver) -> tuple[list[bytes], float]:
     """The numbers of a new solver, and flops."""
     solver = Solver(Options())
     flops = solver.renew(driven, driven.variable_count, driven.factor_count).flops
