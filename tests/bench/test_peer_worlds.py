@@ -30,7 +30,10 @@ def test_the_page_of_results_has_a_line_a_data_set_and_what_was_missed(tmp_path:
     document = {
         "machine": {"cpu": "a processor", "cores": 2}, "rows": rows, "judged": "auto", "notes": ["a note"],
         "over_bus": {"intel": {"insert_ms": {"p50": 0.41, "p99": 1.23}}},
-        "targets": [{"what": "w", "seen": "s", "verdict": MET}, {"what": "x", "seen": "y", "verdict": MISSED}],
+        "targets": [
+            {"what": "w", "seen": "s", "verdict": MET}, {"what": "x", "seen": "y", "verdict": MISSED},
+            {"what": "geometric mean", "seen": "9.5", "verdict": MET},
+        ],
     }  # fmt: skip
     text = results_page.page(document, ["--only", "intel", "--out", str(tmp_path), "--seed", "3"])
     line = "| intel | 300 | 1 s | 7 s (7.0 ×) | 12 s (12.0 ×) | 0.10, 0.3 ms | 1.0000 | 1.0000 | 1.0000 | 0.4, 1.2 ms |"
@@ -38,7 +41,9 @@ def test_the_page_of_results_has_a_line_a_data_set_and_what_was_missed(tmp_path:
     assert (
         "`factorbus bench peers --only intel --seed 3` found, on 2026-02-03, on one core: a processor (2 cores)" in text
     )
-    assert "1 of 2 targets are met" in text
+    assert "2 of 3 targets are met" in text
+    assert "- met: geometric mean: 9.5" in text
+    assert "w: s" not in text
     assert "- MISSED: x: y" in text
     assert "> a note" in text
     assert "Simulated worlds" not in text

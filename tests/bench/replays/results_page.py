@@ -83,11 +83,18 @@ def _worst(row: dict[str, Any] | None) -> str:
 
 
 def _targets(targets: Sequence[dict[str, str]]) -> str:
+    """How many are met, those that are not, and what those of all sets together came to."""
     rest = [each for each in targets if each["verdict"] != MET]
-    if not rest:
-        return f"All {len(targets)} targets are met."
-    lines = [f"- {each['verdict']}: {each['what']}: {each['seen']}".rstrip(": ") for each in rest]
-    return "\n".join([f"{len(targets) - len(rest)} of {len(targets)} targets are met. The others:", "", *lines])
+    means = [each for each in targets if each not in rest and "geometric mean" in each["what"]]
+    counted = f"{len(targets) - len(rest)} of {len(targets)} targets are met. The others:"
+    parts = ["\n".join([counted, "", *map(_line, rest)]) if rest else f"All {len(targets)} targets are met."]
+    if means:
+        parts.append("\n".join(["Of all sets together:", "", *map(_line, means)]))
+    return "\n\n".join(parts)
+
+
+def _line(target: dict[str, str]) -> str:
+    return f"- {target['verdict']}: {target['what']}: {target['seen']}".rstrip(": ")
 
 
 _WORDS = """\
