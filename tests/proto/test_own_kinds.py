@@ -377,3 +377,14 @@ def test_a_message_with_a_bad_formula_is_refused_with_the_place() -> None:
         codec.decode_insert(message)
     assert issubclass(UnknownKind, Problem)
     assert MOST_CHARACTERS < 1 << 15
+
+
+@pytest.mark.parametrize("called", ["pose", "position", "norm", "act", "subtract", "log"])
+def test_a_variable_may_be_called_as_an_operation_is(called: str) -> None:
+    text = f"f({called}:se2,l:point2,z:1)=subtract(norm(subtract(position({called}),l)),z)"
+    plain = read_formula(text.replace(f"({called}:", "(a:").replace(f"position({called})", "position(a)"))
+    read = read_formula(text)
+    assert read.nodes == plain.nodes
+    assert read.variables == ((called, "se2"), ("l", "point2"))
+    with pytest.raises(BadExpression, match=r'wanted "\("'):
+        read_formula("f(a:se2,z:1)=subtract(norm,z)")

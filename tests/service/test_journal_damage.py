@@ -72,6 +72,16 @@ def change(path: Path, at: int, mask: int = 1) -> None:
     path.write_bytes(data)
 
 
+def test_a_bit_of_the_log_is_not_the_end_of_it_through_a_link(tmp_path: Path) -> None:
+    """The log is beside what the link leads to."""
+    folder, linked = written(tmp_path), tmp_path / "linked"
+    linked.mkdir(mode=0o700)
+    (linked / NAME).symlink_to(folder / NAME)
+    change(folder / LOG, 20 * FRAME)
+    with pytest.raises(JournalDamaged):
+        open_store(linked, read_only=True)
+
+
 _TAKES_INDEX = """
 import fcntl, sys
 with open(sys.argv[1], "rb+") as index:

@@ -29,6 +29,7 @@ from factorbus.journal.problems import (
     JournalVersion,
     MapThere,
     NoJournal,
+    NotWritten,
 )
 from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Epoch, JournalRecord
 from factorbus.journal.store import NAME, Checkpoint, Store, create, open_store
@@ -291,6 +292,20 @@ def test_a_map_is_one_file_and_back(store: Store, tmp_path: Path) -> None:
     with pytest.raises(BadFile, match="is damaged"):
         import_map(tmp_path / "broken", tmp_path / "other" / "b")
     assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["n"], "nothing half done is left"
+
+
+def test_a_journal_at_work_is_neither_imported_nor_written_over(store: Store, tmp_path: Path) -> None:
+    """A part of it is in its log; and who exports into its folder may name a file of it."""
+    (tmp_path / "link").symlink_to(store.path)
+    for file in (store.path, tmp_path / "link"):
+        with pytest.raises(BadFile, match=f"a part of which is in {NAME}-wal"):
+            import_map(file, tmp_path / "other" / "n")
+    before = list(store.records())
+    for name in (NAME, "copy.fbmap"):
+        with pytest.raises(NotWritten, match="the journal of a map"):
+            export_map(store.path.parent, store.path.parent / name)
+    assert list(store.records()) == before
+    assert not (tmp_path / "other" / "n").exists()
 
 
 def test_one_owner_until_it_ends_however_it_ends(tmp_path: Path) -> None:

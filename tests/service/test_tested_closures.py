@@ -1,10 +1,12 @@
 """A map that tests its closures: ids, verdicts, what a user says, and the journal, whatever comes in which order."""
 
+from itertools import islice
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from naive.random_plane import contradicting_steps
 from tested_maps import TestedMap, between, corridor, happenings, ids, right
 
 from factorbus.journal.records import ACCEPTED, REFUSED
@@ -368,3 +370,14 @@ def test_counts_are_there_whatever_came() -> None:
     for content in (Batch((), (odometry,)), Batch((Variables("se2", ids(17)),), (odometry,)), Batch()):
         assert made.solver.apply_whole([made.arrived(content)])[1].closures == counts
     assert made.solver.apply_whole([], further=True)[1].closures == counts
+
+
+@pytest.mark.parametrize("policy", ["test", "robust"])
+@pytest.mark.parametrize("seed", [9, 19, 23])
+def test_an_answer_tells_chi2_of_the_revision_that_it_names(seed: int, policy: str) -> None:
+    """Steps that verdicts bring about come behind that of the insert, and its answer names the last one."""
+    made = TestedMap(policy)
+    for batch in islice(contradicting_steps(seed), 6):
+        (answer,) = made.insert(batch)
+        assert answer.revision == made.solver.revision
+        assert answer.report["chi2"] == pytest.approx(made.solver.chi2(), rel=1e-9)

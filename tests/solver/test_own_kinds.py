@@ -8,7 +8,7 @@ from naive.dense_least_squares import distance
 from naive.own_formulas import OWN, both
 from naive.solver_parts import graph_in, keys_in
 
-from factorbus.client.expressions import SE2, SE3, Point3, Vector, factor, norm, sqrt
+from factorbus.client.expressions import SE2, SE3, Point2, Point3, Vector, factor, norm, sqrt
 from factorbus.proto.expressions.formula import read_formula
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Change, Factors, Variables
@@ -19,6 +19,12 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.why import why_factor
 from factorbus.solver.graph.own_kinds import MOST_OWN
+
+
+@factor
+def own_range(a: SE2, l: Point2, z: Vector[1]):
+    return norm(a.position - l) - z
+
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 
@@ -292,3 +298,29 @@ def test_a_change_makes_room_for_the_kinds_of_its_insert() -> None:
         assert FACTOR_KINDS[batch.factors[0].kind].name in graph_in(after).own
         assert after.factor_count == solver.factor_count
         assert len(graph_in(after).own) == MOST_OWN
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_one_that_its_loss_has_set_aside_leaves_the_error_of_others_as_it_is(seed: int) -> None:
+    """With a weight of 0 its linearization error was 0 / 0, and a step had converged whatever was left."""
+    reports = []
+    for kind in ("range_se2", own_range.name):
+        rng, solver = np.random.default_rng(seed), Solver(Options())
+        x, point, each = np.arange(3), np.array([10]), np.repeat(np.array([[1, 0, 0, 1, 0, 1.0]]), 3, 0)
+        variables = (
+            Variables("se2", x, rng.normal(0, 2, (3, 3))),
+            Variables("point2", point, rng.normal(0, 5, (1, 2))),
+        )
+        weak, seen = np.array([[0.01, 0, 0.01]]), np.stack((x, np.full(3, 10)), 1)
+        factors = (
+            Factors("prior_se2", x[:, None], rng.normal(0, 3, (3, 3)), each),
+            Factors("prior_point2", point[None], rng.normal(0, 5, (1, 2)), weak),
+            Factors("bearing_se2", seen, rng.uniform(-3, 3, (3, 1)), np.full((3, 1), 100.0)),
+            Factors("range_se2", seen[1:], rng.uniform(1, 5, (2, 1)), np.full((2, 1), 100.0)),
+            Factors(kind, seen[:1], np.array([[60.0]]), np.eye(1), loss="tukey", scale=np.ones(1)),
+        )
+        solver.stage(Batch(variables, factors))
+        reports.append(solver.step())
+    built_in, own = reports
+    assert own.converged == built_in.converged
+    assert own.chi2 == pytest.approx(built_in.chi2, rel=1e-6)

@@ -26,6 +26,7 @@ def export_map(folder: Path, file: Path) -> int:
 
     Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable, NotWritten.
     """
+    _refuse_in_journal(file)
     beside = file.with_name(f".{file.name}.part")
     store = _open_one_of(folder)
     try:
@@ -49,6 +50,12 @@ def export_map(folder: Path, file: Path) -> int:
     except (sqlite3.Error, OSError) as error:
         beside.unlink(missing_ok=True)
         raise NotWritten(file, str(error)) from None
+
+
+def _refuse_in_journal(file: Path) -> None:
+    """Raises NotWritten for a file in the folder of a map's journal, which a service may be writing."""
+    if (file.absolute().parent / NAME).exists():
+        raise NotWritten(file, f"the journal of a map, {NAME}, is in its folder")
 
 
 def import_map(file: Path, folder: Path) -> None:
@@ -107,6 +114,8 @@ def _check_exported(file: Path) -> None:
     application = int.from_bytes(begins[_APPLICATION_AT : _APPLICATION_AT + 4], "big")
     if not begins.startswith(_MAGIC) or application != APPLICATION:
         raise BadFile(file, "is no exported map")
+    if (log := file.resolve().with_name(f"{file.resolve().name}-wal")).exists():
+        raise BadFile(file, f"is a journal that somebody may be writing, a part of which is in {log.name}")
 
 
 def _unpack(folder: Path, name: str) -> None:

@@ -350,6 +350,8 @@ def open_store(folder: Path, durability: str = "commit", read_only: bool = False
     path = folder / NAME
     if not path.is_file():
         raise NoJournal(path)
+    if path.is_symlink():
+        path = path.resolve()  # beside which the log is
     if not read_only:
         check_own(folder)
     return Store(path, *connected(path, durability, read_only))

@@ -136,7 +136,7 @@ class _Reader:
         calls = list[_Call]()
         while True:
             token = self._next()
-            if token in OPERATIONS:
+            if token in OPERATIONS and not (token in known and self._peek() != "("):  # a variable may be called so
                 self._take("(")
                 calls.append(_Call(token))
                 continue

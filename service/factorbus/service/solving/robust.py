@@ -35,7 +35,6 @@ from factorbus.solver.report import StepReport
 from factorbus.wording import counted as counted_text
 
 _NOTHING: Mapping[str, int] = {}
-_OF_THE_LAST = ("chi2", "converged", "converging")
 _WEIGHT_BY_USER = {RESTORED: 1.0, REJECTED: 0.0}
 
 log = logging.getLogger(__name__)
@@ -70,10 +69,6 @@ class RobustMapSolver(TestedMapSolver):
         graph, revision = self._solver.factor_graph, self._revision
         placed = zip(staged.split.closing, staged.split.places, strict=True)
         return [self._ledger.add(factor, staged.first + place, graph, revision) for factor, place in placed]
-
-    def _report_behind(self, report: dict[str, Any]) -> dict[str, Any]:
-        """Where stages followed: what the last one has come to."""
-        return report | {name: self._last_report[name] for name in _OF_THE_LAST if name in self._last_report}
 
     # ---- stages -----------------------------------------------------------------------------------------------------
 

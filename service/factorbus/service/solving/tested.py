@@ -54,6 +54,7 @@ from factorbus.solver.closures.switching import note_switch, planned_switch
 from factorbus.solver.errors import SolverError
 
 # After these, what hangs together is looked up in the graph again.
+_OF_THE_LAST = ("chi2", "converged", "converging")
 _CUTTING = {"remove_factors", "remove_variables", "marginalize", "fix", "free"}
 
 log = logging.getLogger(__name__)
@@ -248,7 +249,8 @@ class TestedMapSolver(MapSolver):
             yield from self._convert_to_points(below)
 
     def _report_behind(self, report: dict[str, Any]) -> dict[str, Any]:
-        return report
+        """Where steps followed: what the last one has come to, whose revision the answer names."""
+        return report | {name: self._last_report[name] for name in _OF_THE_LAST if name in self._last_report}
 
     def _split(self, batch: Batch) -> SplitFactors:
         return self._forest.split(batch)

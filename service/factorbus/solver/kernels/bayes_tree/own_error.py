@@ -72,7 +72,8 @@ def exact_error_of_own(f: int, graph: Graph, tree: Tree) -> tuple[float, float, 
     for n in range(count_ends(f, fac)):
         v = end_of(f, n, fac)
         for _ in range(dim_of(var[v, at.V_KIND])):
-            if w[diagonal + c] > 0.0 and var[v, at.V_SCALAR] >= 0:
+            # Nothing where its loss has set the factor aside.
+            if root * root * w[diagonal + c] > 0.0 and var[v, at.V_SCALAR] >= 0:
                 total += w[turned + c] * w[turned + c] / (root * root * w[diagonal + c])
             c += 1
     return math.sqrt(max(information_square(dim, p, payload, w), 0.0)), math.sqrt(total), chi2
