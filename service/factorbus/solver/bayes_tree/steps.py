@@ -313,7 +313,7 @@ class TreeSteps:
         result = minimize(system, chi2, damping, rule)
         if result.iterations or taken_back or not settle:
             damped = system.rounded and self._tree.state.item(tl.S_RAISED) >= tl.DAMPED
-            self._follow(system, tl.DAMPED if damped else 0)
+            self._tree.follow(tl.DAMPED if damped else 0, system.diagonal)
             most = result.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN
             self._at_linearization = not self._tree.totals[tl.T_CHI2] <= most or self._has_escaped
             if self._at_linearization:
@@ -323,25 +323,6 @@ class TreeSteps:
         bits = before.view(np.int64), self._graph.values.view(np.int64)
         self._moved = found[: differing(self._mark[at.VARIABLES], count, self._graph.var, *bits, found)]
         return result
-
-    def _follow(self, system: System, damped: int) -> None:
-        """The tree is eliminated at the estimate and makes a step of its own: damped by `damped`, or DAMPED where a
-        pivot was raised then or had failed."""
-        tree, used = self._tree, int(self._graph.counts[at.VALUES])
-        there = self._graph.values[:used].copy()
-        tree.move_all(damped)
-        tree.step()
-        if tree.has_moved and tree.state.item(tl.S_RAISED) != tl.RAISED_PIVOT:
-            return
-        if tree.has_moved:
-            tree.reset_to_linearization()
-        self._graph.values[:used] = there
-        # Pivots are judged by the diagonal of Λ, and it knows that as it was when factors came.
-        tree.note_diagonal(system.diagonal())
-        tree.move_all(tl.DAMPED)
-        tree.step()
-        if not tree.has_moved:
-            tree.totals[tl.T_CHI2] = math.inf
 
     def _sum_chi2(self, factors: int) -> float:
         graph = self._graph

@@ -4,7 +4,7 @@ This is the memory of `kernels/bayes_tree/step.py`, which does the work in one c
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -140,6 +140,26 @@ class CliqueTree(Arenas):
         self.state[tl.S_PENDING] = free.size
         self.state[[tl.S_DUE, tl.S_ONCE]] = 1
         self.state[tl.S_RAISED] = damped
+
+    def follow(self, damped: int, diagonal: Callable[[], F64]) -> None:
+        """Eliminate everything at the estimate, and make a step from there: damped by `damped`, or DAMPED where a pivot
+        was raised then or had failed.  diagonal: gives that of Λ at the estimate.
+        """
+        values = self._graph.values[: self._graph.counts[at.VALUES]]
+        there = values.copy()
+        self.move_all(damped)
+        self.step()
+        if self.has_moved and self.state.item(tl.S_RAISED) != tl.RAISED_PIVOT:
+            return
+        if self.has_moved:
+            self.reset_to_linearization()
+        values[:] = there
+        # Pivots are judged by the diagonal of Λ, and the tree knows that as it was when factors came.
+        self.note_diagonal(diagonal())
+        self.move_all(tl.DAMPED)
+        self.step()
+        if not self.has_moved:
+            self.totals[tl.T_CHI2] = math.inf
 
     def note_diagonal(self, diagonal: F64) -> None:
         """The diagonal of Λ at the estimate, where the next step moves all."""
