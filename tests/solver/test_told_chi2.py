@@ -1,4 +1,4 @@
-"""χ² that is told is that of the estimate, and a step with nothing new does not raise it, in maps that contradict
+"""The reported χ² is that of the estimate, and a step with nothing new does not raise it, in maps that contradict
 themselves: a landmark ends on a pose that sees its bearing, where Λ is 10¹⁵ times what it was when its factors came."""
 
 import pytest

@@ -2,7 +2,7 @@
 
 SQLite tells others by locks of the kernel that it has a database and the index of its log open.  A process loses all
 its locks on a file when it closes it, even where it had opened that to read it, beside SQLite.  SQLite in another
-process then takes the index for one that was left, and cuts it off below whoever is writing.  So a file of a database
+process then takes the index for one that was left, and cuts it off while the service writes.  So a file of a database
 that this process has a connection to is not to be opened in any other way.
 https://www.sqlite.org/howtocorrupt.html, 2.2
 """
