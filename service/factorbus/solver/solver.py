@@ -74,6 +74,7 @@ class Solver:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
 
         budget: in the place of `Options.step_budget`, for this step, and of its range; also where nothing is staged.
+            With a budget a step may raise χ² by up to `Options.converged_share` of it.
 
         Raises BadOption; or Underconstrained or NotFinite, and what was staged since the last step is taken back then,
         and the solver is as it was after that step, bit for bit.

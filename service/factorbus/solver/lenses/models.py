@@ -210,9 +210,10 @@ def project_fisheye(lens: F64, hx: float, hy: float, hz: float) -> tuple:
     """θ = atan2(|h_xy|, h_z), w = (θ_d/|h_xy|) h_xy, (u, v) = (C_x + f_u w_x, C_y + f_v w_y).  MATH (2.7)
 
     ∂w/∂h_xy = m I + c h_xy h_xyᵀ, ∂w/∂h_z = −(dθ_d/dθ)/|h|² h_xy, with m = θ_d/|h_xy| and
-    c = ((dθ_d/dθ) h_z/|h|² − m)/|h_xy|²
+    c = ((dθ_d/dθ) h_z/|h|² − m)/|h_xy|², all of h/|h|_∞: squares of its numbers are neither 0 nor infinite then
     """
-    fu, fv, limit = lens[FU], lens[FV], lens[LIMIT]
+    size, limit = max(abs(hx), abs(hy), abs(hz)), lens[LIMIT]
+    hx, hy, hz = hx / size, hy / size, hz / size
     r2 = hx * hx + hy * hy
     n2 = r2 + hz * hz
     r = math.sqrt(r2)
@@ -224,8 +225,9 @@ def project_fisheye(lens: F64, hx: float, hy: float, hz: float) -> tuple:
         m = d / r
         c = (slope * hz / n2 - m) / r2
     z = -slope / n2
+    u, v, fu, fv = lens[CX] + lens[FU] * m * hx, lens[CY] + lens[FV] * m * hy, lens[FU] / size, lens[FV] / size
     return (
-        status, lens[CX] + fu * m * hx, lens[CY] + fv * m * hy,
+        status, u, v,
         fu * (m + c * hx * hx), fu * c * hx * hy, fu * z * hx,
         fv * c * hx * hy, fv * (m + c * hy * hy), fv * z * hy,
     )  # fmt: skip

@@ -58,11 +58,13 @@ def factorize(
 @part
 def _factorize_in_pieces(plan: I64, records: I64, _scale: F64, queue: I64) -> int:
     """Subtrees on several cores, if it is worth it, and then what is above them; what fails first is what counts."""
-    cut, pieces = cut_whole(records), 0
-    if len(cut) > 0 and count_workers(queue) > 0 and claim(queue):
-        pieces = len(cut)
-        put_entry(plan, CUT, address_of(cut), pieces, SUBTREE)
-        _factorize_together(plan, pieces, queue)
+    cut, pieces = records[:0], 0
+    if count_workers(queue) > 0:
+        cut = cut_whole(records)
+        if len(cut) > 0 and claim(queue):
+            pieces = len(cut)
+            put_entry(plan, CUT, address_of(cut), pieces, SUBTREE)
+            _factorize_together(plan, pieces, queue)
     f = 0
     for k in range(pieces):
         failed = factorize_range(plan, f, cut[k, FIRST], 0, queue)
