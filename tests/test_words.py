@@ -106,3 +106,12 @@ def test_a_page_that_says_where_things_are_names_places_that_there_are(page: str
     assert places
     there = [path.as_posix() for path in modules()]
     assert {place for place in places if not any(path.endswith("/" + place) for path in there)} == set()
+
+
+def test_functions_that_contributing_names_are_where_it_says() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Your first factor kind")[0]
+    named = re.findall(r"`([a-z_0-9]+(?:/[a-z_0-9]+)*\.py)`: `([A-Za-z_]+)`", text)
+    assert named
+    for place, name in named:
+        (path,) = [path for path in modules() if path.as_posix().endswith("/" + place)]
+        assert re.search(rf"^\s*(?:def |class )?{name}\b", path.read_text(encoding="utf-8"), re.MULTILINE), (place, name)

@@ -8,19 +8,17 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, as_list
 from factorbus.client.uncertainty import (
+    Candidates,
     UncertaintyQuestions,
     association_question,
-    factors_of,
     matrix_of,
     paired,
     why_question,
 )
 from factorbus.proto.arrays import F64
 from factorbus.proto.asking import Associated, Covariances, Gained, Gated, Why
-from factorbus.proto.messages import Batch, Factors
 
 
 class Uncertainty:
@@ -63,17 +61,17 @@ class Uncertainty:
 
     async def gate(
         self,
-        candidates: Batch | Draft | Sequence[Factors],
+        candidates: Candidates,
         probability: float = 0.95,
         *,
         timeout_s: float | None = None,
     ) -> Gated:
         """Which of the candidate factors are plausible."""
-        return await asyncio.wrap_future(self._ask.gate(factors_of(candidates), probability, timeout_s))
+        return await asyncio.wrap_future(self._ask.gate(candidates, probability, timeout_s))
 
-    async def gain(self, candidates: Batch | Draft | Sequence[Factors], *, timeout_s: float | None = None) -> Gained:
+    async def gain(self, candidates: Candidates, *, timeout_s: float | None = None) -> Gained:
         """How many nats of information each candidate factor would bring by itself."""
-        return await asyncio.wrap_future(self._ask.gain(factors_of(candidates), timeout_s))
+        return await asyncio.wrap_future(self._ask.gain(candidates, timeout_s))
 
     async def associate(
         self,

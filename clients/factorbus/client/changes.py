@@ -2,8 +2,8 @@
 
     kitchen.change(Changes().remove_factors([17, 18]).loss([21], "dcs", 1.0).fix("x0"))
 
-A factor is called by its id: `first_factor` of the answer to the insert that brought it, and on from there in the order
-of the batch; `Map.graph` tells the ids of all.
+A factor is called by its id: `factors` of the answer to the insert that brought it has them, in the order in which they
+were drafted; `Map.graph` tells the ids of all.
 """
 
 from __future__ import annotations

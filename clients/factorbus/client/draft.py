@@ -383,8 +383,12 @@ class Draft:
         return self.factor(made.kind, made.keys, made.measured, **made.certainty)
 
     def batch(self) -> Batch:
-        """What has been drafted so far, as columns."""
+        """What has been drafted so far, as columns: factors by kind and loss."""
         return self._columns.batch()
+
+    def order(self) -> Sequence[int]:
+        """The place in `batch` of each factor, in the order of the calls; `Accepted.factors` has ids in that order."""
+        return self._columns.order()
 
 
 def batch_of(what: str, given: Batch | Draft) -> Batch:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TypedDict, TypeVar
 
 import numpy as np
@@ -34,6 +34,7 @@ class DraftColumns:
         self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[F64], list[int]]] = {}
         self._factors: dict[tuple[str, str, bool], tuple[list[list[int]], list[F64], list[F64], list[float]]] = {}
         self._linear: list[Factors] = []
+        self._places: list[tuple[tuple[str, str, bool] | None, int]] = []  # of each factor its columns, and its row
 
     def add_variable(self, kind: str, key: int, value: F64 | None, fixed: bool, stamp: int) -> None:
         """value: None where it comes without."""
@@ -48,7 +49,9 @@ class DraftColumns:
     ) -> None:
         """triangle: the upper one of its information.  loss: name and scale, ("", 0) for none."""
         name, scale = loss
-        all_keys, all_measured, triangles, scales = self._factors.setdefault((kind, name, trusted), ([], [], [], []))
+        alike = (kind, name, trusted)
+        all_keys, all_measured, triangles, scales = self._factors.setdefault(alike, ([], [], [], []))
+        self._places.append((alike, len(scales)))
         scales.append(scale)
         all_keys.append(keys)
         all_measured.append(measured)
@@ -56,11 +59,24 @@ class DraftColumns:
 
     def add_linear(self, factor: Factors) -> None:
         """A linear factor, which is a group by itself."""
+        self._places.append((None, len(self._linear)))
         self._linear.append(factor)
 
     def kinds(self) -> dict[int, str]:
         """The kind of each variable, by its key."""
         return {key: kind for (kind, *_), (keys, *_) in self._variables.items() for key in keys}
+
+    def order(self) -> Sequence[int]:
+        """The place in the message of each factor, in the order of their coming."""
+        begins: dict[tuple[str, str, bool] | None, int] = {}
+        count = 0
+        for alike, (keys, *_) in self._factors.items():
+            begins[alike] = count
+            count += len(keys)
+        begins[None] = count
+        if len(begins) == 2 and not self._linear:
+            return range(count)
+        return [begins[alike] + row for alike, row in self._places]
 
     def batch(self) -> Batch:
         """All of it as a message has it."""

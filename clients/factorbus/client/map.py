@@ -12,6 +12,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import checked_bound, checked_flag, checked_seconds, of_type
+from factorbus.client.call_order import call_order, reading_ids
 from factorbus.client.changes import Changes, some_of
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.interest_mirror import InterestMirror
@@ -29,7 +30,7 @@ from factorbus.client.smoothed_poses import BlendedPose, SmoothedPoses
 from factorbus.client.supported import check_batch, check_changes, check_components, check_interest, check_suspects
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
-from factorbus.proto import codec, keys
+from factorbus.proto import keys
 from factorbus.proto.asking import Repaired
 from factorbus.proto.closures import Suspects
 from factorbus.proto.components import Components
@@ -173,7 +174,7 @@ class Map:
 
         Raises Unavailable if the window stays full for `timeout_s`, TooLarge, NotSupported, BadOption: nothing is sent.
         """
-        batch, settle = batch_of("batch", batch), checked_flag("settle", settle)
+        batch, order, settle = batch_of("batch", batch), call_order(batch), checked_flag("settle", settle)
         changes = Changes() if changes is None else of_type("changes", changes, Changes, "a Changes")
         check_batch(self._protocol, batch)
         below = checked_bound("convert_below", convert_below)
@@ -184,7 +185,7 @@ class Map:
             listed = changes.listed_in(self.name, self.epoch)
             check_changes(self._protocol, listed)
             insert = Insert(self._window.next, batch, settle, self.epoch, below, listed)
-            pending_insert = self._pending_insert(insert, timeout_s)
+            pending_insert = self._pending_insert(insert, order, timeout_s)
             with self._lock:
                 self._window.sent(pending_insert)
             self._sender.carry(pending_insert.request)
@@ -348,7 +349,7 @@ class Map:
         self._presence.close()
         self._presence.enter_context(self._link.present(keys.client_token(self.name, self.client)))
 
-    def _pending_insert(self, insert: Insert, timeout_s: float) -> PendingInsert:
+    def _pending_insert(self, insert: Insert, order: Sequence[int], timeout_s: float) -> PendingInsert:
         window = self._window
 
         def then(_: Request, result: Any) -> None:
@@ -363,7 +364,7 @@ class Map:
             wanted = refused.detail.get("next")
             return refused.code == "bad_sequence" and type(wanted) is int and window.waits_for(insert.sequence, wanted)
 
-        sent, read = encoded(insert), codec.decode_accepted
+        sent, read = encoded(insert), reading_ids(order)
         request = Request(f"map {self.name!r}", self._key, sent, read, passing=passing, then=then)
         return PendingInsert(request, insert.sequence, timeout_s)
 

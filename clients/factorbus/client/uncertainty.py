@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import all_finite, as_numbers, checked_probability, checked_seconds, of_type
+from factorbus.client.call_order import call_order, reading_columns
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, as_list, id_numbers, key_number, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
@@ -41,6 +42,7 @@ from factorbus.proto.problems import BadMessage, BadShape
 from factorbus.wording import counted
 
 T = TypeVar("T")
+Candidates: TypeAlias = Batch | Draft | Sequence[Factors]
 
 
 class UncertaintyQuestions:
@@ -60,15 +62,18 @@ class UncertaintyQuestions:
             "covariance", asking_codec.encode_ask_covariance(ask), asking_codec.decode_covariances, timeout_s
         )
 
-    def gate(self, factors: tuple[Factors, ...], probability: float, timeout_s: float | None) -> Future[Gated]:
+    def gate(self, candidates: Candidates, probability: float, timeout_s: float | None) -> Future[Gated]:
         """Which candidates are plausible."""
-        question = asking_codec.encode_ask_gate(AskGate(factors, checked_probability("probability", probability)))
-        return self._ask("gate", question, asking_codec.decode_gated, timeout_s)
+        ask = AskGate(factors_of(candidates), checked_probability("probability", probability))
+        columns = "distance", "dims", "threshold", "plausible"
+        read = reading_columns(asking_codec.decode_gated, columns, call_order(candidates))
+        return self._ask("gate", asking_codec.encode_ask_gate(ask), read, timeout_s)
 
-    def gain(self, factors: tuple[Factors, ...], timeout_s: float | None) -> Future[Gained]:
+    def gain(self, candidates: Candidates, timeout_s: float | None) -> Future[Gained]:
         """What candidates would tell."""
-        question = asking_codec.encode_ask_gain(AskGain(factors))
-        return self._ask("gain", question, asking_codec.decode_gained, timeout_s)
+        question = asking_codec.encode_ask_gain(AskGain(factors_of(candidates)))
+        read = reading_columns(asking_codec.decode_gained, ("gain",), call_order(candidates))
+        return self._ask("gain", question, read, timeout_s)
 
     def associate(self, ask: AskAssociate, timeout_s: float | None) -> Future[Associated]:
         """Which landmark is which."""
@@ -118,17 +123,20 @@ class Uncertainty:
 
     def gate(
         self,
-        candidates: Batch | Draft | Sequence[Factors],
+        candidates: Candidates,
         probability: float = 0.95,
         *,
         timeout_s: float | None = None,
     ) -> Gated:
-        """Which of the candidate factors are plausible, at a gate that a right one passes with `probability`."""
-        return self.ask.gate(factors_of(candidates), probability, timeout_s).result()
+        """Which of the candidate factors are plausible, at a gate that a right one passes with `probability`.
 
-    def gain(self, candidates: Batch | Draft | Sequence[Factors], *, timeout_s: float | None = None) -> Gained:
-        """How many nats of information each candidate factor would bring by itself, whatever it measures."""
-        return self.ask.gain(factors_of(candidates), timeout_s).result()
+        Answers are in the order of the candidates, of a draft in that of the calls.
+        """
+        return self.ask.gate(candidates, probability, timeout_s).result()
+
+    def gain(self, candidates: Candidates, *, timeout_s: float | None = None) -> Gained:
+        """How many nats of information each candidate factor, in the order of the candidates, would bring by itself."""
+        return self.ask.gain(candidates, timeout_s).result()
 
     def associate(
         self,
@@ -166,7 +174,7 @@ def paired(pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key]) -> list[Key]:
     return [key for pair in each for key in pair]
 
 
-def factors_of(candidates: Batch | Draft | Sequence[Factors]) -> tuple[Factors, ...]:
+def factors_of(candidates: Candidates) -> tuple[Factors, ...]:
     """The factors of a draft or a batch.  Raises BadShape when there are variables in it, BadOption."""
     if isinstance(candidates, Draft):
         candidates = candidates.batch()

@@ -6,7 +6,7 @@ little-endian float64 or int64.
 What every insert is made of are named tuples: a frozen dataclass takes three times as long to make.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -118,7 +118,8 @@ class Insert(NamedTuple):
 class Accepted:
     """The answer to an insert: from `revision` on the estimate includes it.
 
-    first_factor: id of the insert's first factor; the others follow in the order of the message.
+    first_factor: id of the insert's first factor; the others follow in the order of the message, which a Draft has by
+    kind and loss.  factors: the ids in the order in which they were drafted; the client knows them, the wire does not.
     applied: inserts that this step took in together.  report: the step's report of work (see StepReport keys
     in `proto/README.md`): strategy, because, chi2, iterations, step_ms, ...
     """
@@ -129,6 +130,7 @@ class Accepted:
     first_factor: int
     applied: int
     report: Mapping[str, Any] = field(default_factory=Report)
+    factors: Sequence[int] = field(default=(), compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

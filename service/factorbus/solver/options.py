@@ -23,8 +23,9 @@ class Options:
     backend         "blocks": block multifrontal Cholesky; "cholmod": CHOLMOD on scalars, through scikit-sparse
     clock           seconds, for the phases in the report; without one they are zero
     relinearize_threshold   bayes-tree: a variable waits to be relinearized once a factor of it has a linearization
-                    error of more than this many of the residuals that factors of the map have on average (MATH §9.6);
-                    math.inf: none does, and a step that leaves more to gain says that it has not converged
+                    error of more than this many of the residuals that factors of the map have on average (MATH §9.6).
+                    Whatever it is, a step relinearizes until it has converged, so that relinearization is rarer where
+                    converged_share is larger, too; math.inf: what convergence takes is all there is
     wildfire_threshold   bayes-tree: back-substitution goes on where δ is off by more than would add the square of this
                     as a share to χ², if all scalars were (MATH §9.7)
     converged_share a step has converged if what is left to gain is at most this share of χ² (MATH §9.6); it goes on for
