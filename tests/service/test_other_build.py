@@ -337,7 +337,7 @@ def test_what_another_build_refused_as_diverged_stays_refused(
 ) -> None:
     """This build may take it: the client was told that it did not go in."""
     session = reopen()
-    monkeypatch.setattr(apply, "find_diverged", lambda *_: Diverged("se2 x1", 1e13, 1e12))
+    monkeypatch.setattr(apply, "find_diverged", lambda *_: Diverged("se2 x1", "1e+13", 1e12))
     session.insert(BATCHES[INSERTS])
     monkeypatch.undo()
     before, revision = session.values(), session.map_solver.revision

@@ -4,5 +4,6 @@ Standard library alone, so that everything may import it.
 """
 
 from factorbus.wording.counted import counted
+from factorbus.wording.outside import outside
 
-__all__ = ["counted"]
+__all__ = ["counted", "outside"]

@@ -28,6 +28,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, are_usual
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
+from factorbus.wording import outside
 
 
 def check_step(solver: Solver, report: StepReport) -> None:
@@ -45,11 +46,14 @@ def find_diverged(changed: I64, graph: FactorGraph, report: StepReport) -> error
         beyond = np.flatnonzero(~(np.abs(value) <= MOST_NUMBER))
         if not beyond.size:
             where = f"the scale of {kind} {errors.printed(key)}"
-            return errors.Diverged(where, float(value[-1]), MOST_NUMBER, key=key, least=LEAST_SCALE)
-        return errors.Diverged(f"{kind} {errors.printed(key)}", float(value[beyond[0]]), MOST_NUMBER, key=key)
+            return errors.Diverged(
+                where, outside(float(value[-1]), LEAST_SCALE, MOST_NUMBER), MOST_NUMBER, key=key, least=LEAST_SCALE
+            )
+        seen = outside(float(value[beyond[0]]), -MOST_NUMBER, MOST_NUMBER)
+        return errors.Diverged(f"{kind} {errors.printed(key)}", seen, MOST_NUMBER, key=key)
     if math.isfinite(report.chi2) and math.isfinite(report.chi2_before):
         return None
-    return errors.Diverged("χ²", max(report.chi2, report.chi2_before), math.inf)
+    return errors.Diverged("χ²", f"{max(report.chi2, report.chi2_before):g}", math.inf)
 
 
 def is_elsewhere(solver: Solver, report: StepReport) -> bool:

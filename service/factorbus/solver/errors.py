@@ -40,7 +40,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from factorbus.wording import counted
+from factorbus.wording import counted, outside
 from factorbus.wording.picklable import Picklable
 
 _INDEX_BITS = 56
@@ -191,11 +191,11 @@ class OutOfBounds(SolverError):
 
     def __init__(self, where: str, seen: float, least: float, most: float, advice: str) -> None:
         wanted = f"at most {most:g} in magnitude" if least <= 0.0 else f"{least:g} to {most:g}"
+        told = outside(seen, least, most)
         super().__init__(
-            f"{where} is {seen:.6g}, wanted {wanted}: beyond that its squares are lost to rounding, or overflow; "
-            f"{advice}",
+            f"{where} is {told}, wanted {wanted}: beyond that its squares are lost to rounding, or overflow; {advice}",
             where=where,
-            seen=f"{seen:.6g}",
+            seen=told,
             wanted=wanted,
             least=least,
             most=most,
@@ -205,14 +205,14 @@ class OutOfBounds(SolverError):
 class Diverged(SolverError):
     code = "diverged"
 
-    def __init__(self, what: str, seen: float, most: float, **more: Any) -> None:
+    def __init__(self, what: str, seen: str, most: float, **more: Any) -> None:
         bounds = f"{more['least']:g} to {most:g}" if "least" in more else f"at most {most:g} in magnitude"
         wanted = bounds if math.isfinite(most) else "a finite number"
         super().__init__(
-            f"the step would leave {what} at {seen:.6g}, wanted {wanted}: what was inserted does not determine "
+            f"the step would leave {what} at {seen}, wanted {wanted}: what was inserted does not determine "
             "it, or contradicts the map; the map is as it was. Leave the factor out, or add a prior",
             where=what,
-            seen=f"{seen:.6g}",
+            seen=seen,
             wanted=wanted,
             most=most,
             **more,
@@ -222,11 +222,11 @@ class Diverged(SolverError):
 class BadQuaternion(SolverError):
     code = "bad_quaternion"
 
-    def __init__(self, where: str, norm: float) -> None:
+    def __init__(self, where: str, norm: str) -> None:
         super().__init__(
-            f"{where}: the quaternion has length {norm:.6g}, wanted length 1 to within 1e-3, in the order qx qy qz qw",
+            f"{where}: the quaternion has length {norm}, wanted length 1 to within 1e-3, in the order qx qy qz qw",
             where=where,
-            seen=f"{norm:.6g}",
+            seen=norm,
             wanted="length 1 to within 1e-3",
         )
 
@@ -364,12 +364,12 @@ class NamedTwice(SolverError):
 class BadWeight(SolverError):
     code = "bad_weight"
 
-    def __init__(self, factor: int, seen: float, wanted: str) -> None:
+    def __init__(self, factor: int, seen: str, wanted: str) -> None:
         super().__init__(
-            f"weight of factor {factor}: seen {seen:g}, wanted {wanted}; to count it for nothing, remove it",
+            f"weight of factor {factor}: seen {seen}, wanted {wanted}; to count it for nothing, remove it",
             factor=factor,
             where=f"weight of factor {factor}",
-            seen=f"{seen:g}",
+            seen=seen,
             wanted=wanted,
         )
 

@@ -35,6 +35,7 @@ from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.elimination import Elimination
+from factorbus.wording import outside
 
 _GROWTH, _ROUNDS = 1.4, 100
 # A weight of nothing keeps the pattern of Λ, and its pivots: a hundred millionth of a factor holds nothing.
@@ -69,7 +70,7 @@ def repair(graph: FactorGraph, factors: I64 | None = None, probability: float = 
     probability: with which a right measurement is within c².  Raises UnknownFactor, BadOption.
     """
     if not _SURE[0] <= probability <= _SURE[1]:
-        raise errors.BadOption("probability", f"{probability:g}", f"from {_SURE[0]:g} to 1 - {_SURE[0]:g}")
+        raise errors.BadOption("probability", outside(probability, *_SURE), f"from {_SURE[0]:g} to 1 - {_SURE[0]:g}")
     rows = find_loops(graph) if factors is None else _rows(graph, factors)
     problem = _Problem(graph, rows, probability)
     before = problem.cost(graph.values)

@@ -28,7 +28,7 @@ from factorbus.solver import errors
 from factorbus.solver.changes.carrying import carry_along
 from factorbus.solver.changes.marginal import marginals
 from factorbus.solver.closures.naming import NotAClosure
-from factorbus.solver.graph.admission import out_of_bounds
+from factorbus.solver.graph.admission import UNIT_LENGTH, out_of_bounds
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factor_rows import is_first, losses_of, of_whole_factors, rows_of_factors
 from factorbus.solver.graph.factors import LOSSES
@@ -37,6 +37,7 @@ from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KIN
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_INFORMATION, LEAST_SCALE, MOST_INFORMATION, MOST_NUMBER
+from factorbus.wording import outside
 
 CHANGES = (
     "remove_factors",
@@ -53,7 +54,6 @@ CHANGES = (
 # A marginal is of the graph as it is: of what came before in the insert, it sees what is removed and nothing else.
 _BEFORE_MARGINALIZE = {"remove_factors", "remove_variables"}
 _NONE = np.empty(0, np.int64)
-_QUATERNION_TOLERANCE = 1e-3
 _WEIGHTS = (1e-12, 1e12)  # beyond, a factor holds nothing, or nothing else does
 
 
@@ -186,7 +186,11 @@ def _set_loss(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
         scale = _numbers("loss", "scale", change.scale, rows.size)
         if (bad := np.flatnonzero(~((scale >= LEAST_SCALE) & (scale <= MOST_NUMBER)))).size:
             wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
-            raise errors.BadLoss(f"change loss of factor {_id(graph, rows, bad)}", f"{scale[bad[0]]:g}", wanted)
+            raise errors.BadLoss(
+                f"change loss of factor {_id(graph, rows, bad)}",
+                outside(float(scale[bad[0]]), LEAST_SCALE, MOST_NUMBER),
+                wanted,
+            )
         code, edits.scale[rows] = LOSSES[change.loss], scale
     edits.loss[rows] = code
     edits.touched[rows_of_factors(graph.fac, rows)] = True
@@ -197,7 +201,9 @@ def _weigh(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     weight = _numbers("weigh", "weight", change.weight, rows.size)
     least, most = _WEIGHTS
     if (bad := np.flatnonzero(~((weight >= least) & (weight <= most)))).size:
-        raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]), f"from {least:g} to {most:g}")
+        raise errors.BadWeight(
+            _id(graph, rows, bad), outside(float(weight[bad[0]]), least, most), f"from {least:g} to {most:g}"
+        )
     np.multiply.at(edits.weight, rows, weight)
     _check_weighed(graph, edits, rows)
     edits.touched[rows_of_factors(graph.fac, rows)] = True
@@ -211,7 +217,7 @@ def _check_weighed(graph: FactorGraph, edits: Edits, rows: I64) -> None:
         least, most = LEAST_INFORMATION / diagonal.min(axis=1), MOST_INFORMATION / omega.max(axis=1)
         bad = np.flatnonzero(~((least <= edits.weight[of]) & (edits.weight[of] <= most)))
         if bad.size:
-            seen = float(edits.weight[of[bad[0]]])
+            seen = outside(float(edits.weight[of[bad[0]]]), float(least[bad[0]]), float(most[bad[0]]))
             wanted = f"{least[bad[0]]:g} to {most[bad[0]]:g}, which keeps its information in bounds"
             raise errors.BadWeight(_id(graph, of, bad), seen, wanted)
 
@@ -252,8 +258,10 @@ def _checked(kind: str, picked: I64, values: F64, graph: FactorGraph) -> F64:
     if at_q >= 0:
         turns = values[:, at_q : at_q + 4]
         norms = np.linalg.norm(turns, axis=1)
-        for row in np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_TOLERANCE).tolist():
-            raise errors.BadQuaternion(f"{kind} {errors.printed(int(keys[row]))}", float(norms[row]))
+        for row in np.flatnonzero((norms < UNIT_LENGTH[0]) | (norms > UNIT_LENGTH[1])).tolist():
+            raise errors.BadQuaternion(
+                f"{kind} {errors.printed(int(keys[row]))}", outside(float(norms[row]), *UNIT_LENGTH)
+            )
         turns /= norms[:, None]
     if kind in ("se2", "idp"):
         angle = 2 if kind == "se2" else 3

@@ -37,7 +37,9 @@ from factorbus.solver.kernels.model.bounds import (
     find_first_outside,
 )
 from factorbus.solver.kernels.model.expression_layout import X_NUMBER
+from factorbus.wording import outside
 
+UNIT_LENGTH = (1.0 - 1e-3, 1.0 + 1e-3)  # of a quaternion, as it may come
 _NEAR = "choose units and an origin near the data"
 
 
@@ -151,7 +153,9 @@ def _find_bad_row(graph: FactorGraph, raw: bytes, group: I64, n: int, fault: int
     if fault == gt.BAD_SCALE:
         scale = floats_at(raw, int(group[gt.G_SCALE]) + 8 * n, 1)[0]
         wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
-        return errors.BadLoss(f"{kind} {LOSS_OF_CODE[loss]}", f"the scale {scale:g}", wanted)
+        return errors.BadLoss(
+            f"{kind} {LOSS_OF_CODE[loss]}", f"the scale {outside(scale, LEAST_SCALE, MOST_NUMBER)}", wanted
+        )
     arity, triangle = len(kind.connects), kind.triangle
     information = floats_at(raw, int(group[gt.G_INFORMATION]) + 8 * n * triangle, triangle)
     measured = floats_at(raw, numbers + 8 * n * kind.size, kind.size)
@@ -175,7 +179,7 @@ def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.
     where = f"{kind} {errors.printed(key)}"
     if wrong == gt.BAD_QUATERNION and value is not None:
         at_q = wire.VARIABLE_KINDS[kind].quaternion_at
-        return errors.BadQuaternion(where, float(np.linalg.norm(value[at_q : at_q + 4])))
+        return errors.BadQuaternion(where, outside(float(np.linalg.norm(value[at_q : at_q + 4])), *UNIT_LENGTH))
     if (scale := _scale_out_of_bounds(where, kind, value)) is not None:
         return scale
     return out_of_bounds(f"the value of {where}", np.zeros(0) if value is None else value)
@@ -196,7 +200,7 @@ def _bad_factor(
     if wrong == gt.SELF_LOOP:
         return errors.SelfLoop(keys[later], where)
     if wrong == gt.BAD_QUATERNION:
-        return errors.BadQuaternion(where, _worst_norm(kind, measured))
+        return errors.BadQuaternion(where, outside(_worst_norm(kind, measured), *UNIT_LENGTH))
     if wrong == gt.BAD_RANGE and kind.size == wire.VARIABLE_KINDS["sim3"].size:
         return _scale_out_of_bounds(where, "sim3", measured) or errors.BadRange(where, float(measured[-1]))
     if wrong == gt.BAD_RANGE:
