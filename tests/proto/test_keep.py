@@ -31,6 +31,14 @@ def test_what_is_not_said_is_usual() -> None:
     assert keep_text("all") == "all"
 
 
+@pytest.mark.parametrize("number", [2.0, 0.5, 1.23456789, 123456.789, 999999.9, 0.001, 1 / 3, 1e6])
+def test_its_text_has_all_digits(number: float) -> None:
+    """Else a map keeps by another policy than it was made with."""
+    text = keep_text({"per_area": number, "loss": number})
+    assert try_keep(text) == KeepSettings(number, 1, 50, 2, number)
+    assert keep_text(text) == text
+
+
 def test_a_mapping_is_as_good_as_text() -> None:
     wanted = keep_text("per_area=2:3,window=7")
     assert keep_text({"window": 7, "per_area": (2, 3)}) == keep_text({"per_area": "2:3", "window": 7}) == wanted

@@ -70,8 +70,14 @@ def keep_text(given: str | Mapping[str, Any] | KeepSettings, where: str = KEEP_O
     settings = given if isinstance(given, KeepSettings) else try_keep(given, where)
     if settings is None:
         return KEEP_ALL
-    area = f"{settings.per_area_m:g}:{settings.poses}"
-    return f"per_area={area},window={settings.window},landmarks={settings.landmarks},loss={settings.loss:g}"
+    area = f"{_digits(settings.per_area_m)}:{settings.poses}"
+    return f"per_area={area},window={settings.window},landmarks={settings.landmarks},loss={_digits(settings.loss)}"
+
+
+def _digits(number: float) -> str:
+    """As short as it may be for the same number to come of it."""
+    short = f"{number:g}"
+    return short if float(short) == number else repr(float(number))
 
 
 def _number(where: str, name: str, text: str, least: float, most: float) -> float:
