@@ -61,7 +61,7 @@ print(f"moved by {moved_robust:.3f} m")
 # %%
 why = town.uncertainty.why("x150").variable
 for factor in sorted(why["factors"], key=lambda each: -each["chi2"]):
-    print(f"{factor['kind']}  χ² {factor['chi2']:.3g}  leverage {factor['influence'] / factor['dims']:.0%}")
+    print(f"{factor['kind']}  χ² {factor['chi2']:.3g}  leverage {factor['leverage'] / factor['dims']:.0%}")
 
 # %% [markdown]
 # ```text

@@ -108,7 +108,8 @@ def test_a_full_window_blocks_and_says_so(start: Callable[..., Service], endpoin
         assert caught.value.pending_insert is first
         with pytest.raises(Unavailable, match="2 inserts without an answer"):
             kitchen.flush(0.05)
-        kitchen.close()
+        with pytest.raises(Unavailable, match="closed first"):
+            kitchen.close()
         with pytest.raises(Unavailable, match="closed first"):
             first.result()
         with pytest.raises(Unavailable, match="open it again"):

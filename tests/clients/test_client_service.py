@@ -136,6 +136,38 @@ def test_what_is_refused_leaves_the_map_as_it_was(service: Service) -> None:
         assert strict.insert(step(2)).revision == before.revision + 1
 
 
+@pytest.mark.parametrize("closing", ["map", "bus", "with"])
+def test_leaving_says_what_was_refused_and_nobody_has_looked_at(service: Service, closing: str) -> None:
+    """Also where the answer has not come yet: then that there is none."""
+    bus = connect(service.endpoint, client="leaver", timeout_s=60)
+    left = bus.map(f"left-{closing}")
+    left.insert(start())
+    seen, unseen = left.send(step(3)), left.send(step(5))
+    with pytest.raises(Refused):
+        seen.result()
+    unseen.request.future.exception(60)  # until it is answered; nobody looks at what it says
+    with pytest.raises(Refused) as caught:
+        if closing == "map":
+            left.close()
+        elif closing == "bus":
+            bus.close()
+        else:
+            with bus:
+                pass
+    assert caught.value.code == "unknown_variable"
+    assert left.closed
+    left.close()
+    bus.close()
+
+
+def test_leaving_after_an_error_raises_that_error(service: Service) -> None:
+    with pytest.raises(ZeroDivisionError), connect(service.endpoint, client="failing", timeout_s=60) as bus:
+        joined = bus.map("failing")
+        joined.insert(start())
+        joined.send(step(7)).request.future.exception()
+        raise ZeroDivisionError
+
+
 def test_a_stream_through_the_window_and_a_viewer_that_comes_late(service: Service) -> None:
     with connect(service.endpoint, timeout_s=60) as bus, bus.map("stream", window=16) as stream:
         stream.send(start())

@@ -68,7 +68,7 @@ def check_factor(told: dict[str, Any], known: DenseCovariance, atol: float, rel:
         "chi2": s,
         "rho": rho(loss, scale, s),
         "weight": w,
-        "influence": w * np.trace(W @ spread),
+        "leverage": w * np.trace(W @ spread),
         "without": rho(loss, scale, s) + rest,
     }.items():
         np.testing.assert_allclose(told[name], number, rtol=rel, err_msg=name)

@@ -310,19 +310,19 @@ def test_why_a_factor(seed: int) -> None:
     """χ² without a factor, and how much of it is known from it, by solving without it."""
     solver = solved(seed, "all-batch", steps=4)
     twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
-    influence = 0.0
+    leverage = 0.0
     for factor in range(solver.factor_count):
         explained = why_factor(blocks, factor)
         keys = list(explained.keys)
         kind, _, z, W = next(each for each in twin.graph.factors if each[0] == explained.kind and each[1] == keys)
         r, T, noise = twin.innovation(kind, keys, z, W[np.triu_indices(len(W))])
         np.testing.assert_allclose(explained.chi2, r @ W @ r, rtol=1e-7, atol=1e-12)
-        np.testing.assert_allclose(explained.influence, np.trace(W @ T), rtol=1e-6, atol=1e-8)
-        influence += explained.influence
+        np.testing.assert_allclose(explained.leverage, np.trace(W @ T), rtol=1e-6, atol=1e-8)
+        leverage += explained.leverage
         if explained.without is not None:
             np.testing.assert_allclose(explained.without, r @ np.linalg.solve(noise - T, r), rtol=1e-4, atol=1e-9)
     # All factors together know as much as there is to know.
-    assert influence == pytest.approx(len(twin.sigma), rel=1e-8)
+    assert leverage == pytest.approx(len(twin.sigma), rel=1e-8)
     with pytest.raises(UnknownFactor):
         why_factor(blocks, solver.factor_count)
 

@@ -150,17 +150,17 @@ def test_gates_and_gains_are_those_of_dense_matrices(world: str, seed: int) -> N
 @every_world
 def test_why_says_of_such_a_factor_what_it_says_of_others(world: str) -> None:
     solver = solved(world, 1, steps=5)
-    twin, blocks, influence = dense(solver), CovarianceBlocks(solver.covariances.factored()), 0.0
+    twin, blocks, leverage = dense(solver), CovarianceBlocks(solver.covariances.factored()), 0.0
     for factor, (kind, keys, z, W) in enumerate(_by_id(solver)):
         account = why_factor(blocks, factor)
         r, T, noise = twin.innovation(kind, keys, z, W[np.triu_indices(len(W))])
         assert (account.kind, list(account.keys)) == (kind, keys)
         np.testing.assert_allclose(account.chi2, r @ W @ r, rtol=1e-7, atol=1e-12)
-        np.testing.assert_allclose(account.influence, np.trace(W @ T), rtol=1e-6, atol=1e-8)
-        influence += account.influence
+        np.testing.assert_allclose(account.leverage, np.trace(W @ T), rtol=1e-6, atol=1e-8)
+        leverage += account.leverage
         if account.without is not None:
             np.testing.assert_allclose(account.without, r @ np.linalg.solve(noise - T, r), rtol=1e-4, atol=1e-9)
-    assert influence == pytest.approx(len(twin.sigma), rel=1e-7)
+    assert leverage == pytest.approx(len(twin.sigma), rel=1e-7)
     for v, key in enumerate(keys_in(solver)):
         account = why_variable(blocks, v, keeps_steps=True)
         assert [each.factor for each in account.factors] == [

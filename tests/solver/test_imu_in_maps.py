@@ -147,7 +147,7 @@ def _by_id(solver: Solver) -> list[tuple[str, list[int], np.ndarray, np.ndarray]
 @pytest.mark.parametrize("form", FORMS)
 def test_why_accounts_for_it_as_for_any_factor(form: str) -> None:
     solver = solved(1, steps=5, form=FORMS[form])
-    twin, blocks, influence = dense(solver), CovarianceBlocks(solver.covariances.factored()), 0.0
+    twin, blocks, leverage = dense(solver), CovarianceBlocks(solver.covariances.factored()), 0.0
     for factor, (kind, keys, z, W) in enumerate(_by_id(solver)):
         account = why_factor(blocks, factor)
         r, T, noise = twin.innovation(kind, keys, z, W[np.triu_indices(len(W))])
@@ -155,11 +155,11 @@ def test_why_accounts_for_it_as_for_any_factor(form: str) -> None:
         # Samples near their bias are expanded, to 1e-5 standard deviations.
         np.testing.assert_allclose(account.residual, residual(kind, [by_key(solver)[k][1] for k in keys], z), atol=1e-5)
         np.testing.assert_allclose(account.chi2, r @ W @ r, rtol=1e-4, atol=1e-7)
-        np.testing.assert_allclose(account.influence, np.trace(W @ T), rtol=1e-5, atol=1e-7)
-        influence += account.influence
+        np.testing.assert_allclose(account.leverage, np.trace(W @ T), rtol=1e-5, atol=1e-7)
+        leverage += account.leverage
         if account.without is not None:
             np.testing.assert_allclose(account.without, r @ np.linalg.solve(noise - T, r), rtol=1e-3, atol=1e-7)
-    assert influence == pytest.approx(len(twin.sigma), rel=1e-6)
+    assert leverage == pytest.approx(len(twin.sigma), rel=1e-6)
     for v, key in enumerate(keys_in(solver)):
         account = why_variable(blocks, v, keeps_steps=True)
         assert [each.factor for each in account.factors] == [

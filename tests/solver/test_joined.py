@@ -155,7 +155,7 @@ def test_what_asks_about_it_gets_an_answer() -> None:
         assert explained.pivot > 0.0
         assert 0.0 < explained.conditioning <= 1.0 + 1e-9
         total += sum(f.chi2 / len(f.keys) for f in explained.factors)
-        assert all(f.chi2 >= 0.0 and f.influence >= 0.0 for f in explained.factors)
+        assert all(f.chi2 >= 0.0 and f.leverage >= 0.0 for f in explained.factors)
     assert total == pytest.approx(solver.chi2(), rel=1e-9)
     assert factor not in graph.ids_of(find_loops(graph)).tolist(), "marginals are no suspects of themselves"
     assert repair(graph).false.size == 0

@@ -237,7 +237,7 @@ def test_an_observation_that_is_lost_counts_for_nothing_and_is_reported(mode: st
         CovarianceBlocks(solver.covariances.factored()), graph_in(solver).find(P), keeps_steps=False
     ).factors
     assert [each.inactive for each in explained] == ["", why, ""]
-    assert (explained[1].influence, explained[1].weight, explained[1].rho) == (0.0, 0.0, INACTIVE_CHI2)
+    assert (explained[1].leverage, explained[1].weight, explained[1].rho) == (0.0, 0.0, INACTIVE_CHI2)
     assert (explained[1].residual.tolist(), explained[1].without) == ([0.0, 0.0], INACTIVE_CHI2)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from examples import examples
-from factorbus.solver import Options, Tuning
+from factorbus.solver import Options, Solver, Tuning
 from factorbus.solver.errors import BadOption, SolverError
 from factorbus.solver.option_ranges import RANGES, SWITCHES
 
@@ -100,3 +100,9 @@ def test_any_value_is_taken_as_it_is_or_refused(name: str, value: Any) -> None:
     else:
         with pytest.raises(BadOption):
             Options.of(**{name: value})
+
+
+@pytest.mark.parametrize("options", [5, "bayes-tree", {"mode": "auto"}, 0, ""])
+def test_what_is_no_options_is_refused(options: Any) -> None:
+    with pytest.raises(BadOption, match="wanted an Options"):
+        Solver(options)

@@ -94,7 +94,7 @@ def test_covariance_gate_gain_and_why_are_those_of_the_solvers_kinds() -> None:
     for n in range(usual.factor_count):
         first, second = (asdict(why_factor(blocks, n)) for blocks in (here, there))
         assert second["kind"] == OWN.get(first["kind"], FACTOR_KINDS[first["kind"]]).name
-        for name in ("chi2", "influence"):
+        for name in ("chi2", "leverage"):
             assert second[name] == pytest.approx(first[name], rel=1e-4, abs=1e-7)
 
 

@@ -128,7 +128,7 @@ def test_why(square: tuple[Map, Solver]) -> None:
     first = explained.variable["factors"][0]
     assert factor.keys() == first.keys()
     assert (factor["kind"], factor["keys"], factor["chi2"]) == (first["kind"], first["keys"], first["chi2"])
-    assert factor["influence"] == pytest.approx(first["influence"], rel=1e-9)
+    assert factor["leverage"] == pytest.approx(first["leverage"], rel=1e-9)
 
 
 @pytest.mark.parametrize("named", [["x77"], ["x1", "x2", "x3", "x4", "x5", "x6", "x7", "x8", "x77"]])

@@ -89,7 +89,7 @@ class Bus:
             yield here
             await here.flush()
         finally:
-            await asyncio.to_thread(joined.close)
+            await asyncio.to_thread(joined.close, quietly=True)
 
     @asynccontextmanager
     async def features(self, camera: Camera, **prior: Any) -> AsyncIterator[Features]:

@@ -2,6 +2,7 @@
 
 import secrets
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from numbers import Integral
 from os import PathLike
 from typing import Any
@@ -67,8 +68,8 @@ class Bus:
     def __enter__(self) -> "Bus":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, kind: object, *_: object) -> None:
+        self.close(quietly=kind is not None)
 
     def map(
         self,
@@ -114,7 +115,7 @@ class Bus:
             if mirror:
                 joined.open_mirror(part)
         except BaseException:
-            joined.close()
+            joined.close(quietly=True)
             raise
         return joined
 
@@ -244,12 +245,18 @@ class Bus:
             if not (missing_ok and refused.code == UnknownMap.code):
                 raise self._named(name, refused) from None
 
-    def close(self) -> None:
-        """Leave all maps and the bus.  What is unanswered fails with Unavailable."""
-        for opened in (*self._maps, *self._features):
-            opened.close()
-        self._sender.close()
-        self._link.close()
+    def close(self, *, quietly: bool = False) -> None:
+        """Leave all maps and the bus.  What is unanswered fails with Unavailable.
+
+        Unless quietly it raises, of the first map that has one, what `Map.close` raises.
+        """
+        with ExitStack() as leaving:  # all are left, whatever one of them raises
+            leaving.callback(self._link.close)
+            leaving.callback(self._sender.close)
+            for opened in reversed(self._features):
+                leaving.callback(opened.close)
+            for joined in reversed(self._maps):
+                leaving.callback(joined.close, quietly=quietly)
 
     def _existing(self, name: str) -> MapRow:
         """As the map tells of itself: who may only ask a map need not be allowed to list all of them."""

@@ -75,7 +75,7 @@ class Map:
             if kind is None:
                 self.flush()
         finally:
-            self.close()
+            self.close(quietly=True)
 
     @property
     def closed(self) -> bool:
@@ -211,12 +211,9 @@ class Map:
     def wait_converged(self, timeout_s: float | None = None) -> None:
         """Wait until everything sent is answered and the map, left alone since, goes on no more by itself.
 
-        It is at its optimum then, to 1e-6 of χ²; or, where `stats()["gave_up"]` says why it came no nearer, within a
-        thousandth.  Nothing more is published until the next insert, and the mirror has it.  Nothing is sent for it: a
-        map goes on by itself when nobody inserts, for a tenth of a second where it has not converged, else for a
-        second.  `settle` demands it at once, as a step.
-        Raises NotConverged when time is up, or at once where the map gave up before it had converged; as `flush` does;
-        Unavailable for a map opened with mirror=False.
+        It is at its optimum then, to 1e-6 of χ², or within a thousandth where `stats()["gave_up"]` says why.  Nothing
+        is sent for it: a map goes on by itself within a second.  `settle` demands it at once, as a step.
+        Raises NotConverged when time is up, or where the map gave up; Unavailable with mirror=False; as `flush` does.
         """
         end = time.monotonic() + checked_seconds("timeout_s", timeout_s, self.timeout_s)
         self.flush(max(end - time.monotonic(), 0.0))
@@ -253,7 +250,7 @@ class Map:
 
         Where the map is above it by more than 1 % the answer's `notice` says so (`better_optimum`), and
         `change(Changes().adopt(answer), settle=True)` puts the map there.  `batch_converged` is false where the search
-        for the optimum ended before it had converged: it may be lower.  Raises Refused, Unavailable.
+        ended before: the optimum may be lower.  Raises Refused, Unavailable.
         """
         return self.ask.chi2(batch, timeout_s, values).result()
 
@@ -308,8 +305,10 @@ class Map:
         """
         return logged(self.name, self.ask.export(format, timeout_s, robot, strict, ids).result())
 
-    def close(self) -> None:
-        """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait."""
+    def close(self, *, quietly: bool = False) -> None:
+        """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait.  Unless
+        quietly it raises the first refusal, or insert without an answer, that nobody has looked at.
+        """
         with self._lock:
             already, self._closed = self._closed, True
             self._changed.notify_all()
@@ -318,6 +317,8 @@ class Map:
                 self._give_up("the map was closed first")
             self._presence.close()
             self._stack.close()
+            if not quietly:
+                raise_unseen(self._window.take_refused())
 
     def open_mirror(self, interest: Interest | None = None) -> None:
         """Start the live estimate, or that of a part, and wait for it.  Raises Unavailable, NotSupported, Refused."""

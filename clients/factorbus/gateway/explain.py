@@ -89,7 +89,7 @@ def _row(factor: Mapping[str, Any]) -> dict[str, Any]:
         "weight": factor["weight"],
         "rho": factor["rho"],
         "misfit": math.sqrt(factor["chi2"] / factor["dims"]),
-        "known": factor["influence"] / factor["dims"],
+        "known": factor["leverage"] / factor["dims"],
         "without": factor["without"],
     }
 

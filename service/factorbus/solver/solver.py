@@ -11,6 +11,7 @@ from factorbus.solver.changes.convert_to_points import find_convertible
 from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.source import CovarianceSource
+from factorbus.solver.errors import BadOption
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.columns import Columns
@@ -41,7 +42,9 @@ class Solver:
     NOT_KEPT = ("_options", "covariances")
 
     def __init__(self, options: Options | None = None) -> None:
-        self._options = options or Options()
+        self._options = Options() if options is None else options
+        if not isinstance(self._options, Options):
+            raise BadOption("options", repr(self._options)[:80], "an Options, or None for the defaults")
         if self._options.backend == "cholmod":
             require_cholmod()
         self._graph = FactorGraph()

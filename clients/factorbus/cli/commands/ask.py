@@ -300,7 +300,7 @@ def _factor_line(explained: Any, step: Any) -> str:
     fall = "no redundancy: nothing else measures it"
     if without is not None:
         fall = f"without it χ² falls by {fall_without(without, step)}"
-    share = f"leverage {explained['influence']:.2f} of {explained['dims']}"
+    share = f"leverage {explained['leverage']:.2f} of {explained['dims']}"
     if not loss:
         return f"χ² {explained['chi2']:.3g}, {share}, {fall}"
     rho, weight = explained["rho"], explained["weight"]

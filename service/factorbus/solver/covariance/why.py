@@ -30,7 +30,7 @@ class FactorExplanation:
     residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: s = rᵀ Ω r; all as without loss
     loss: its name, or ""   weight: w = ρ'(s) of it, 1 without one   rho: ρ(s), what it counts in χ²; s without a loss
     inactive: why an observation has no pixel, and so no r (0) and no weight (0), and s is 900; else ""
-    influence: tr(w Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
+    leverage: tr(w Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
     without: by how much χ² would fall without it (10.8); None: nothing else measures what it does
     """
 
@@ -41,7 +41,7 @@ class FactorExplanation:
     weighted: F64
     chi2: float
     dims: int
-    influence: float
+    leverage: float
     without: float | None
     loss: str
     weight: float
