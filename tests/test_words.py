@@ -114,4 +114,7 @@ def test_functions_that_contributing_names_are_where_it_says() -> None:
     assert named
     for place, name in named:
         (path,) = [path for path in modules() if path.as_posix().endswith("/" + place)]
-        assert re.search(rf"^\s*(?:def |class )?{name}\b", path.read_text(encoding="utf-8"), re.MULTILINE), (place, name)
+        assert re.search(rf"^\s*(?:def |class )?{name}\b", path.read_text(encoding="utf-8"), re.MULTILINE), (
+            place,
+            name,
+        )

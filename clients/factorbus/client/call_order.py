@@ -1,4 +1,4 @@
-"""The order in which factors were drafted, where a message has them by kind and loss: ids and answers follow the calls."""
+"""The order in which factors were drafted, which ids and answers follow, though a message has them by kind and loss."""
 
 from __future__ import annotations
 
