@@ -156,11 +156,15 @@ def test_leaving_says_what_was_refused_and_nobody_has_looked_at(service: Service
 
 
 def test_leaving_after_an_error_raises_that_error(service: Service) -> None:
-    with pytest.raises(ZeroDivisionError), connect(service.endpoint, client="failing", timeout_s=60) as bus:
-        joined = bus.map("failing")
-        joined.insert(start())
-        joined.send(step(7)).request.future.exception()
-        raise ZeroDivisionError
+    def fail() -> None:
+        with connect(service.endpoint, client="failing", timeout_s=60) as bus:
+            joined = bus.map("failing")
+            joined.insert(start())
+            joined.send(step(7)).request.future.exception()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
 
 
 def test_a_stream_through_the_window_and_a_viewer_that_comes_late(service: Service) -> None:
