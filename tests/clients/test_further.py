@@ -1,5 +1,7 @@
 """Drafts of what a sensor measures of which more is a variable: kinds, keys, and places on the Earth."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from naive.dense_factors import residual
@@ -7,8 +9,8 @@ from naive.dense_factors import residual
 from factorbus.client import Camera, Draft
 from factorbus.client.geodetic import FLATTENING, SEMI_MAJOR_M, ecef, enu
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.problems import BadInformation, BadOption, BadShape, NotFiniteNumbers
-from factorbus.proto.symbols import format_symbol
+from factorbus.proto.problems import BadInformation, BadLoss, BadOption, BadShape, NotFiniteNumbers
+from factorbus.proto.symbols import format_symbol, symbol
 
 CAMERA = Camera("pinhole", (500.0, 500.0, 320.0, 240.0))
 HERE = (0.0, 0, 0, 0, 0, 0, 1)
@@ -161,3 +163,12 @@ def test_places_that_are_none_are_refused() -> None:
         add("x0", *ORIGIN, origin=ORIGIN, sigma=1)  # type: ignore[call-arg]
     with pytest.raises(BadInformation, match="sigmas"):
         add("x0", *ORIGIN, origin=ORIGIN)
+
+
+@pytest.mark.parametrize("scale", [2, 2.0, np.float64(1.5), np.int64(3)])
+def test_a_number_beside_a_loss_by_name_is_not_taken_for_the_key_of_a_scale(scale: Any) -> None:
+    sure: Any = {"sigmas": (0.1, 0.1, 0.02), "scale": scale}
+    with pytest.raises(BadLoss, match=r'loss=\("huber", '):
+        Draft().between_se2("x0", "x1", (1, 0, 0), loss="huber", **sure)
+    keyed = Draft().between_se2("x0", "x1", (1, 0, 0), loss="huber", sigmas=(0.1, 0.1, 0.02), scale=int(symbol("s", 0)))
+    assert keyed.batch().factors[0].kind == "between_se2_scale"

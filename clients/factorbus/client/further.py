@@ -19,11 +19,12 @@ from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.proto.arrays import F64
 from factorbus.proto.derived_kinds import LENSES
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.problems import BadOption, BadShape
+from factorbus.proto.problems import BadLoss, BadOption, BadShape
 from factorbus.proto.symbols import format_symbol
 
 _KEYWORDS = {"arm": "lever"}  # what a modifier is called here, where its name is another
 # In the order that names of kinds have them in.
+_LETTERLESS = 1 << 56  # keys with a letter are not below
 MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset", *LENSES)
 
 
@@ -139,6 +140,7 @@ def _together(kind: str, given: tuple[str, ...]) -> str:
 def odometry(kind: str, keys: tuple[Key, Key], measured: ArrayLike, certainty: Mapping[str, Any]) -> Measured:
     """A relative pose; kind: `between_se2` or `between_se3`.  Raises as `sensed`."""
     where, mount = " ".join([kind, *(format_symbol(key_number(key)) for key in keys)]), certainty.get("mount")
+    _check_scale(where, certainty.get("loss"), certainty.get("scale"))
     if mount is None or isinstance(mount, str | int):
         return sensed(kind, keys, measured, certainty, OdometryCertainty)
     if certainty.get("scale") is not None:
@@ -173,6 +175,13 @@ def with_information(key: Key, certainty: Mapping[str, Any]) -> Mapping[str, Any
             raise BadShape(f"{where}: sigmas", f"shape {shape}", "(3,): of east, north, up (metres)")
         return rest
     return {**rest, **inverted(where, certainty["covariance"], rest)}
+
+
+def _check_scale(where: str, loss: object, scale: object) -> None:
+    """A number beside a loss without a scale is that of the loss, not the key of a variable.  Raises BadLoss."""
+    if isinstance(loss, str) and isinstance(scale, (int, float, np.number)) and abs(scale) < _LETTERLESS:
+        wanted = f'loss=("{loss}", {scale}); scale= is the key of a variable, such as "s0"'
+        raise BadLoss(where, f"loss={loss!r} beside scale={scale!r}", wanted)
 
 
 class _WithArm(AntennaCertainty, total=False):
