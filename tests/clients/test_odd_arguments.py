@@ -50,7 +50,7 @@ WHOLE: dict[str, dict[str, Any]] = {
     },
     "vector": {"key": "b0", "value": (0, 0)},
 }  # fmt: skip
-ELSEWHERE = ("batch", "imu", "imu_preintegrated")  # no keywords of their own; held by tests of their own
+ELSEWHERE = ("batch", "order", "imu", "imu_preintegrated")  # no keywords of their own; held by tests of their own
 
 
 def measured_by(kind: str) -> tuple[float, ...]:
