@@ -43,18 +43,27 @@ def listening_problem(where: str, error: OSError) -> Problem:
 def check_free(where: str, host: str, port: int) -> None:
     """Whether a process could listen at `host`:`port` now; `where` is how an error calls it.
 
-    Raises PortTaken, CannotListen.
+    One of the addresses that `host` is a name of will do.  Raises PortTaken, CannotListen.
     """
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-            probe.listen(1)
-    except OverflowError:
-        raise CannotListen(where, "a port is 0 to 65535") from None
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except OSError as error:
         raise listening_problem(where, error) from None
+    except OverflowError:
+        raise CannotListen(where, "a port is 0 to 65535") from None
+    problems = []
+    for family, kind, _, _, address in addresses:
+        try:
+            with socket.socket(family, kind) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+                probe.listen(1)
+            return
+        except OverflowError:
+            raise CannotListen(where, "a port is 0 to 65535") from None
+        except OSError as error:
+            problems.append(listening_problem(where, error))
+    raise next((each for each in problems if isinstance(each, PortTaken)), problems[0])
 
 
 def check_endpoints(endpoints: Iterable[str]) -> None:
@@ -62,5 +71,5 @@ def check_endpoints(endpoints: Iterable[str]) -> None:
     for endpoint in endpoints:
         protocol, _, address = endpoint.partition("/")
         host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
-        if protocol in _STREAMS and port.isdecimal():
+        if protocol in _STREAMS and port.isdecimal() and "iface=" not in address:
             check_free(f"{protocol}/{host}:{port}", host.strip("[]"), int(port))

@@ -36,6 +36,7 @@ from factorbus.service.bus.senders import Senders
 from factorbus.service.bus.zenoh_session import (
     ServiceBus,
     UpstreamBus,
+    check_listening,
     check_zenoh_files,
     ignore,
     key_of,
@@ -56,7 +57,7 @@ from factorbus.service.jobs.worker_latency import WorkerLatency
 from factorbus.service.journal.library import Library, log_owner, open_library
 from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.operations.health_report import HealthReport
-from factorbus.service.operations.metrics import open_metrics
+from factorbus.service.operations.metrics import check_metrics, open_metrics
 from factorbus.service.operations.start import ready_to_compute
 from factorbus.service.process.health import Health
 from factorbus.service.process.worker_threads import WorkerThreads
@@ -93,6 +94,9 @@ def serve(
     # Who only waits for the folder has everything ready by then; who cannot have it says so before compiling.
     library = open_library(config, log_owner, stop) if config.journal and not config.standby else None
     try:
+        if not config.standby:  # the owner that it waits for may have its addresses, too
+            check_listening(config)
+            check_metrics(config.metrics)
         with ready_to_compute(config.warm):
             if config.standby:
                 library = open_library(config, log_owner, stop)

@@ -167,6 +167,8 @@ def checked_config(config: Config) -> Config:
         raise BadConfig(f"cores_from_bytes is {config.cores_from_bytes}; wanted 0, for maps of any size, or more")
     if config.metrics and not _HOST_PORT.fullmatch(config.metrics):
         raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
+    if config.metrics and int(config.metrics.rpartition(":")[2]) > 65535:
+        raise BadConfig(f"metrics is {config.metrics!r}; wanted a port from 0 to 65535")
     if config.closures not in CLOSURE_POLICIES:
         raise BadConfig(f"closures is {config.closures!r}; wanted {' or '.join(CLOSURE_POLICIES)}")
     if not BUDGET_SPAN_MS[0] <= config.budget_ms <= BUDGET_SPAN_MS[1]:

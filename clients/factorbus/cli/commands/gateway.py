@@ -9,7 +9,7 @@ import click
 from factorbus.cli.output.exits import require
 from factorbus.cli.process.bind_address import insecure_option, is_loopback, refuse_open_page
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.options import WholeNumber, connect_option, zenoh_option
+from factorbus.cli.process.options import PAGE_HOST, WholeNumber, connect_option, zenoh_option
 
 if TYPE_CHECKING:
     from factorbus.gateway.people import People
@@ -32,7 +32,7 @@ class GatewayRequest:
 @click.command()
 @connect_option
 @zenoh_option
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0: all of them.")
+@click.option("--host", default=PAGE_HOST, show_default=True, help="Address to listen at; 0.0.0.0: all of them.")
 @click.option(
     "--port", type=WholeNumber(0, 65535), default=8080, show_default=True, help="To listen at; 0: any free one."
 )

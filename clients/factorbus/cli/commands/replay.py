@@ -16,6 +16,7 @@ from factorbus.cli.driving.replay_table import replay_rows
 from factorbus.cli.output.exits import REFUSED, Stopped, missing_modules, require
 from factorbus.cli.output.starts import optimum_from
 from factorbus.cli.process.options import (
+    PAGE_HOST,
     SECONDS,
     Number,
     WholeNumber,
@@ -29,6 +30,7 @@ from factorbus.cli.process.options import (
 from factorbus.cli.process.parameters_file import NodeCommand, params_file_option
 from factorbus.cli.process.reading import reading_options, told_of
 from factorbus.cli.process.robot_options import robot_options
+from factorbus.proto.ports import check_free
 from factorbus.ros2.options import RobotOptions
 
 _ANSWER_S, _LISTENING_S = 10.0, 0.6
@@ -206,6 +208,7 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
         require("viz", "--plot")
     if request.live:
         require("gateway", "--live")
+        check_free(f"{PAGE_HOST}:{request.port}", PAGE_HOST, request.port)
     request = replace(request, file=source_of(request.file))
     graph, steps = read_steps(request.file, request.robot, request.dialect, request.strict, request.use_values)
     with _target(request) as target:

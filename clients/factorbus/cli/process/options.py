@@ -15,6 +15,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 # Where a service listens, and where clients look for one, without an address of their own.
 USUAL_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_ENDPOINT = os.environ.get("FACTORBUS_ENDPOINT") or USUAL_ENDPOINT
+PAGE_HOST = "127.0.0.1"  # where a page for browsers is served, without an address of its own
 # The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
 MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch", "bayes-tree")
 # The endings of pictures; `tests/clients/test_cli_files.py` holds them to those of `factorbus.viz`.

@@ -46,6 +46,12 @@ def check_zenoh_files(config: Config) -> None:
             refuse_unsafe_keys(config.upstream_zenoh, _reader(settings))
 
 
+def check_listening(config: Config) -> None:
+    """The same of the addresses where it is to listen.  Raises PortTaken, CannotListen."""
+    if config.mode != "client":
+        check_endpoints(config.listen)
+
+
 def open_service_bus(config: Config) -> "ServiceBus":
     """The bus as `config` describes it.  Raises BadConfig; Exposed and UnsafeKeys are such.  Raises PortTaken,
     CannotListen.
@@ -55,8 +61,7 @@ def open_service_bus(config: Config) -> "ServiceBus":
     try:
         return ServiceBus(zenoh.open(settings))
     except zenoh.ZError as error:
-        if config.mode != "client":
-            check_endpoints(config.listen)
+        check_listening(config)
         where = redact.endpoint(", ".join(config.listen if config.mode != "client" else config.connect))
         raise BadConfig(
             f"cannot open {where}: {redact.reason(error)}; is the address right, and its certificate there?"

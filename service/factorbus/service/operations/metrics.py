@@ -11,9 +11,10 @@ import logging
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
-from factorbus.proto.ports import listening_problem
+from factorbus.proto.ports import check_free, listening_problem
 from factorbus.service.config import BadConfig
 from factorbus.service.operations.health_report import HealthReport
 
@@ -42,27 +43,39 @@ class Metrics:
             self._server.server_close()
 
 
+def check_metrics(where: str) -> None:
+    """Whether metrics could be served at `where`, or need not be.  Raises BadConfig, PortTaken, CannotListen."""
+    if where:
+        if find_spec("prometheus_client") is None:
+            raise BadConfig("metrics need prometheus-client, of the extra `service`: factorbus doctor")
+        host, port = _address(where)
+        check_free(_named(where), host, port)
+
+
 def open_metrics(where: str, health_report: HealthReport) -> Metrics:
     """Serve what `health_report` knows at `where` (HOST:PORT); nowhere if that is empty.
 
-    Raises BadConfig, PortTaken, CannotListen.
+    Raises PortTaken, CannotListen.
     """
     if not where:
         return Metrics()
+    host, port = _address(where)
     try:
-        import prometheus_client  # noqa: F401
-    except ImportError:
-        raise BadConfig("metrics need prometheus-client, of the extra `service`: factorbus doctor") from None
-    host, _, port = where.rpartition(":")
-    try:
-        server = _Server((host.strip("[]"), int(port)), _handler(health_report))
+        server = _Server((host, port), _handler(health_report))
     except OSError as error:
-        raise listening_problem(f"{where}, for metrics,", error) from None
-    except OverflowError:
-        raise BadConfig(f"metrics is {where!r}; wanted a port from 0 to 65535") from None
+        raise listening_problem(_named(where), error) from None
     opened = Metrics(server)
     log.info("metrics at http://%s:%d/metrics", host, opened.port, extra={"port": opened.port})
     return opened
+
+
+def _address(where: str) -> tuple[str, int]:
+    host, _, port = where.rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def _named(where: str) -> str:
+    return f"{where}, for metrics,"
 
 
 class Family(NamedTuple):
