@@ -147,10 +147,10 @@ def test_a_zenoh_configuration_is_a_file_and_said_to_be_one(content: str | None,
         path.write_text(content)
     ran = typed("maps", *NOWHERE, "--zenoh", str(path))
     assert ran.returncode == BAD_FILE
-    assert ran.stderr.startswith(f"factorbus: the zenoh configuration {path} cannot be read: ")
+    assert ran.stderr.startswith(f"factorbus: the Zenoh configuration {path} cannot be read: ")
     ran = typed("maps", *NOWHERE, ZENOH_CONFIG=str(path))
     assert ran.returncode == BAD_FILE
-    assert ran.stderr.startswith(f"factorbus: the zenoh configuration {path}, which ZENOH_CONFIG names, cannot be read")
+    assert ran.stderr.startswith(f"factorbus: the Zenoh configuration {path}, which ZENOH_CONFIG names, cannot be read")
     assert ran.stderr.endswith("[bad_file]\n")
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 import factorbus.solver
+from factorbus.proto.problems import BadConfigurationFile
 from factorbus.service import app
 from factorbus.service.config import BadConfig, Config
 from factorbus.workers.app import work
-from factorbus.workers.config import BadConfig as BadWorkerConfig
 from factorbus.workers.config import WorkerConfig
 
 REPLICA = Config(listen=("tcp/127.0.0.1:0",), upstream="tcp/127.0.0.1:9", journal="maps")
@@ -45,17 +45,17 @@ def not_reached(*_: Any, **__: Any) -> Any:
 def test_a_service_does_not_begin_with_it(setting: str, case: str, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app, "ready_to_compute", not_reached)
     config = replace(REPLICA, **{setting: str(file)})
-    with pytest.raises(BadConfig, match=BAD[case][1]) as bad:
+    with pytest.raises(BadConfigurationFile, match=BAD[case][1]) as bad:
         app.serve(config, not_reached, threading.Event())
     assert str(file) in bad.value.message
-    assert bad.value.code == "bad_config"
+    assert bad.value.code == "bad_file"
     assert not Path("maps").exists()
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_worker_does_not_begin_with_it(case: str, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(factorbus.solver, "warm", not_reached)
-    with pytest.raises(BadWorkerConfig, match=BAD[case][1]) as bad:
+    with pytest.raises(BadConfigurationFile, match=BAD[case][1]) as bad:
         work(WorkerConfig(zenoh=str(file)), not_reached, threading.Event())
     assert str(file) in bad.value.message
 

@@ -14,6 +14,7 @@ from factorbus.cli.output.console import document
 from factorbus.cli.output.exits import BAD_FILE, EXIT_CODES, INTERRUPTED, OK, USAGE, Stopped, report
 from factorbus.proto.nearest import nearest
 from factorbus.proto.version import __version__
+from factorbus.wording.unreadable import mend_of
 
 # name -> (module, one line).  The lines stand here so that `factorbus --help` imports none of the commands.
 COMMANDS = {
@@ -52,6 +53,7 @@ COMMANDS = {
 }
 _HIDDEN = ("robot",)
 _GROUPS = ("ask", "change", "plot", "journal", "datasets")  # commands that have commands
+_NOT_REACHED = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 _EPILOG = """\b
@@ -128,8 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return OK
     except OSError as error:
-        if error.errno == errno.ENAMETOOLONG:  # which nobody who looks whether a path is there expects
-            told = f"{error.filename} cannot be read: {error.strerror}; name another path"
+        if error.errno in _NOT_REACHED and error.filename is not None:  # by who only looked whether it is there
+            told = f"{error.filename} cannot be read: {error.strerror}; {mend_of(error)}"
             return report(Stopped("bad_file", told, BAD_FILE, path=str(error.filename)), as_json, debug)
         if error.errno not in _FULL or error.filename is not None:
             return report(error, as_json=as_json, debug=debug)

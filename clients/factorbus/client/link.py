@@ -19,7 +19,7 @@ from factorbus.client.replies import AnswerReply, Failure, Reply, Silence, Timed
 from factorbus.proto import keys, redact
 from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.problems import BadConfigurationFile, BadSetting, ClosedHere, NobodyListens, Unavailable
-from factorbus.wording.unreadable import is_device
+from factorbus.proto.zenoh_file import check_zenoh_file
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
 _TIMED_OUT = b"Timeout"
@@ -211,8 +211,8 @@ def _config(endpoints: Sequence[str], settings: Mapping[str, Any], file: str) ->
     for endpoint in endpoints:
         checked_endpoint(endpoint)
     variable = _VARIABLE if os.environ.get(_VARIABLE) == file else ""
-    if file and is_device(file):
-        raise BadConfigurationFile(os.fspath(file), "it is a device, and no file", variable)
+    if file:
+        check_zenoh_file(file, variable)
     try:
         config = zenoh.Config.from_file(file) if file else zenoh.Config()
     except zenoh.ZError as error:

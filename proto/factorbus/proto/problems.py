@@ -5,7 +5,7 @@
     ├── BadName              bad_name             a map, client or worker name outside [A-Za-z0-9_-]{1,64}
     ├── BadEndpoint          bad_endpoint         an address on the bus that cannot be read
     ├── BadSetting           bad_setting          a setting of the connection that the bus does not take
-    ├── BadConfigurationFile bad_file             a zenoh configuration file that cannot be read (client side)
+    ├── BadConfigurationFile bad_file             a Zenoh configuration file that cannot be read
     ├── BadInput             (of those below)     something given that is not what is wanted at its place
     │   ├── BadShape         bad_shape            numbers whose count does not fit their kind (client side)
     │   ├── NotFiniteNumbers not_finite           a NaN or an infinity among numbers for a map (client side)
@@ -114,13 +114,13 @@ class BadSetting(Problem):
 
 
 class BadConfigurationFile(Problem):
-    """A zenoh configuration file.  from_environment: the variable that names it; empty: an argument or option did."""
+    """A Zenoh configuration file.  from_environment: the variable that names it; empty: an argument or option did."""
 
     code = "bad_file"
 
     def __init__(self, file: str, reason: str, from_environment: str = "") -> None:
         named = f", which {from_environment} names," if from_environment else ""
-        super().__init__(f"the zenoh configuration {file}{named} cannot be read: {reason}", path=file)
+        super().__init__(f"the Zenoh configuration {file}{named} cannot be read: {reason}", path=file)
 
 
 class BadInput(Problem):

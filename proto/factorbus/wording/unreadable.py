@@ -1,5 +1,6 @@
 """What to do about a file that cannot be read, for a person; and which is none."""
 
+import errno
 import os
 import stat
 
@@ -22,5 +23,7 @@ def mend_of(error: OSError) -> str:
     if isinstance(error, FileNotFoundError | NotADirectoryError):
         return "look for its name with ls; a path that does not begin with / is from the folder you are in"
     if isinstance(error, PermissionError):
-        return "have its owner allow it, chmod a+r, or run this as its owner"
+        return "have its owner allow it, chmod a+r, of a folder a+rx, or run this as its owner"
+    if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+        return "name another path"
     return _OTHERWISE

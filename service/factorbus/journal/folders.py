@@ -5,7 +5,7 @@ import re
 from collections.abc import Container
 from pathlib import Path
 
-from factorbus.journal.problems import UnsafeJournal
+from factorbus.journal.problems import JournalUnreadable, UnsafeJournal
 from factorbus.ownership import UnsafeFolder, check_folder, make_private
 
 # What begins so is on its way: made and not finished, dropped and not yet gone, being imported.  No map's name does.
@@ -17,8 +17,15 @@ _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 def maps_in(folder: Path, file: str, known: Container[str] = ()) -> list[str]:
     """The maps in `folder`: names of folders that have `file`, or what is written beside it, in order.
 
-    known: names that are not looked at and not returned.
+    known: names that are not looked at and not returned.  Raises JournalUnreadable without permission to look; OSError.
     """
+    try:
+        return _maps_in(folder, file, known)
+    except PermissionError as error:
+        raise JournalUnreadable(folder, error.strerror) from None
+
+
+def _maps_in(folder: Path, file: str, known: Container[str]) -> list[str]:
     named = [path for path in folder.iterdir() if _NAME.fullmatch(path.name) and path.name not in known]
     return sorted(path.name for path in named if is_map(path, file))
 

@@ -71,6 +71,8 @@ def _open(folder: Path) -> int:
             os.fchmod(descriptor, 0o600)
         return descriptor
     except OSError:
+        if not (folder / NAME).exists():
+            raise
         check_own(folder)
         # A disk that is read-only has owners, too.
         return os.open(folder / NAME, os.O_RDONLY | os.O_CLOEXEC)

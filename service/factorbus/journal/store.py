@@ -19,7 +19,7 @@ from factorbus.journal.connecting import APPLICATION, FORM, connected, connectio
 from factorbus.journal.digest import digest_of
 from factorbus.journal.faults import list_faults
 from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_folder
-from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal, NotWritten
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, NoJournal, NotWritten
 from factorbus.journal.records import Checkpoint, Entry, Epoch, Header, JournalRecord, Last, Maker, Sender
 from factorbus.ownership import private_file
 from factorbus.proto.own_clients import JUDGE, KEEPER
@@ -348,7 +348,11 @@ def open_store(folder: Path, durability: str = "commit", read_only: bool = False
     Raises NoJournal, UnsafeJournal, JournalDamaged, JournalVersion, JournalUnreadable.
     """
     path = folder / NAME
-    if not path.is_file():
+    try:
+        there = path.is_file()
+    except PermissionError as error:
+        raise JournalUnreadable(path, error.strerror) from None
+    if not there:
         raise NoJournal(path)
     if path.is_symlink():
         path = path.resolve()  # beside which the log is

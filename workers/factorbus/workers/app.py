@@ -19,9 +19,9 @@ from zenoh.handlers import Callback
 
 from factorbus.proto import codec, keys, redact
 from factorbus.proto.messages import JobDone
-from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
+from factorbus.proto.problems import BadConfigurationFile, Busy, Internal, Problem, ShuttingDown
+from factorbus.proto.zenoh_file import check_zenoh_file
 from factorbus.solver.errors import SolverError
-from factorbus.wording.unreadable import is_device
 from factorbus.workers import jobs
 from factorbus.workers.config import BadConfig, WorkerConfig, checked_worker_config
 from factorbus.workers.heap import keep_freed_memory
@@ -92,14 +92,17 @@ def _settings(config: WorkerConfig) -> zenoh.Config:
         "transport/link/tx/lease": 3000,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
     }
-    if config.zenoh and is_device(config.zenoh):
-        raise BadConfig(f"the Zenoh configuration {config.zenoh} is a device; wanted a file")
+    if config.zenoh:
+        check_zenoh_file(config.zenoh)
     try:
         settings = zenoh.Config.from_file(config.zenoh) if config.zenoh else zenoh.Config()
+    except zenoh.ZError as error:
+        # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
+        raise BadConfigurationFile(config.zenoh, redact.reason(error)) from None
+    try:
         for path, value in paths.items():
             settings.insert_json5(path, json.dumps(value))
     except zenoh.ZError as error:
-        # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
         where = config.zenoh or "built in"
         raise BadConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
     return settings

@@ -8,11 +8,11 @@ from factorbus.cli.commands.merging import read_candidates
 from factorbus.cli.output.advice import ATTACHING, advising
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import OK
-from factorbus.cli.process.options import MapAddress
+from factorbus.cli.process.options import PATH, MapAddress
 
 
 @click.argument("letters")
-@click.argument("candidates", type=click.Path(path_type=Path))
+@click.argument("candidates", type=PATH)
 @click.option(
     "--sigmas",
     metavar="S",

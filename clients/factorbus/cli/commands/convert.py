@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from factorbus.cli.output.exits import output_file
-from factorbus.cli.process.options import file_argument, grouped, json_option
+from factorbus.cli.process.options import PATH, file_argument, grouped, json_option
 from factorbus.cli.process.reading import (
     COUNTED,
     GRAPHS,
@@ -51,7 +51,7 @@ class ConvertOptions:
 )
 @click.option("--ground-truth", is_flag=True, help="Write the ground truth of a .jrl in place of its values.")
 @click.option(
-    "--loops", type=click.Path(path_type=Path), metavar="FILE",
+    "--loops", type=PATH, metavar="FILE",
     help="Of a SOURCE that is a trajectory: loop closures, lines of first second tx ty tz qx qy qz qw [sigma_m "
     "sigma_rad], poses by their place (0 1 2 ...) or time.",
 )  # fmt: skip

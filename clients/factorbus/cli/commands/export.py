@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.process.options import journal_option, json_option
+from factorbus.cli.process.options import PATH, journal_option, json_option
 from factorbus.proto.keys import checked_name
 
 
@@ -17,7 +17,7 @@ from factorbus.proto.keys import checked_name
 )
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="PATH",
     help="The file, or with --all the folder.  [default: MAP.fbmap here; here]",
 )

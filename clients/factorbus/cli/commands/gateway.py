@@ -9,7 +9,7 @@ import click
 from factorbus.cli.output.exits import require
 from factorbus.cli.process.bind_address import insecure_option, is_loopback, refuse_open_page
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.options import PAGE_HOST, WholeNumber, connect_option, zenoh_option
+from factorbus.cli.process.options import PAGE_HOST, PATH, WholeNumber, connect_option, zenoh_option
 
 if TYPE_CHECKING:
     from factorbus.gateway.people import People
@@ -41,7 +41,7 @@ class GatewayRequest:
 )
 @click.option(
     "--people",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="Who may edit: names and tokens by role, a TOML file. Without it all may who reach 127.0.0.1.",
 )

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import click
 
-from factorbus.cli.process.options import journal_option, json_option
+from factorbus.cli.process.options import PATH, journal_option, json_option
 from factorbus.proto.keys import LONGEST_NAME, checked_name, is_name
 
 
 @click.command()
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=PATH)
 @journal_option
 @click.option("--as", "name", metavar="MAP", help="Its name here, of one FILE.  [default: that of the file]")
 @json_option

@@ -9,7 +9,7 @@ import click
 from factorbus.cli.output.advice import MERGING, advising
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import OK, input_file
-from factorbus.cli.process.options import MapAddress, grouped
+from factorbus.cli.process.options import PATH, MapAddress, grouped
 from factorbus.wording import counted
 
 
@@ -56,7 +56,7 @@ class MergeOptions:
 @click.option(
     "--align",
     "candidates",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="Candidates, of which many may be false: a line POSE OTHERS Z [SIGMAS] for each, numbers as for --anchor.",
 )

@@ -11,7 +11,7 @@ import click
 from factorbus.cli.output.exits import require
 from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.options import DEFAULT_ENDPOINT, SECONDS, WholeNumber, grouped, zenoh_option
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, FOLDER, SECONDS, WholeNumber, grouped, zenoh_option
 from factorbus.cli.process.parameters_file import NodeCommand, params_file_option
 from factorbus.cli.process.robot_options import robot_options
 from factorbus.ros2.options import BridgeOptions
@@ -74,9 +74,7 @@ class NodeOptions:
 @click.option(
     "--services/--no-services", default=True, show_default=True, help="settle, save, fork, repair, as Trigger."
 )
-@click.option(
-    "--save-folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Where the service saves."
-)
+@click.option("--save-folder", type=FOLDER, metavar="DIR", help="Where the service saves.")
 @click.option(
     "--display", type=SECONDS, default=1.0, show_default=True, metavar="SECONDS", help="Least time between paths."
 )

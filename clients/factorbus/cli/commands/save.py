@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING
 import click
 
 from factorbus.cli.output.exits import REFUSED, Stopped, output_file
-from factorbus.cli.process.options import checked_output, connect_option, json_option, timeout_option, zenoh_option
+from factorbus.cli.process.options import (
+    PATH,
+    checked_output,
+    connect_option,
+    json_option,
+    timeout_option,
+    zenoh_option,
+)
 from factorbus.cli.process.reading import GRAPHS, IDS, ROBOT_LOGS, check_chosen, say, told_of
 
 if TYPE_CHECKING:
@@ -17,7 +24,7 @@ _WRITES = (*GRAPHS, ".tum", ".kitti")
 
 @click.command()
 @click.argument("name", metavar="MAP")
-@click.argument("target", type=click.Path(path_type=Path), callback=checked_output, metavar="FILE")
+@click.argument("target", type=PATH, callback=checked_output, metavar="FILE")
 @click.option("--robot", metavar="LETTER", help="The trajectory of this robot alone: the letter of its poses' keys.")
 @click.option(
     "--ids",

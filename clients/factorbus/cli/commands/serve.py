@@ -9,7 +9,7 @@ from factorbus.cli.output.exits import input_file, require
 from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
 from factorbus.cli.process.notify import Notifier
-from factorbus.cli.process.options import USUAL_ENDPOINT
+from factorbus.cli.process.options import PATH, USUAL_ENDPOINT
 
 
 @click.command()
@@ -23,9 +23,7 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
 @click.option(
     "--map", "create", multiple=True, metavar="NAME", help="A map to have from the start; clients may create others."
 )
-@click.option(
-    "--config", type=click.Path(path_type=Path), metavar="FILE.toml", help="Settings; what is given here wins."
-)
+@click.option("--config", type=PATH, metavar="FILE.toml", help="Settings; what is given here wins.")
 @click.option("--zenoh", metavar="FILE.json5", help="Zenoh configuration: TLS, users, access control (deploy/zenoh).")
 @click.option(
     "--insecure",

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import output_file
-from factorbus.cli.process.options import WORLDS, WholeNumber, json_option, out_option
+from factorbus.cli.process.options import FOLDER, WORLDS, WholeNumber, json_option, out_option
 from factorbus.wording import counted
 
 
@@ -18,7 +18,7 @@ from factorbus.wording import counted
 @out_option("--out", "out", "What the robot measured; a .jrl has the truth as well.", "FILE.g2o|.pyfg|.jrl|.cbor")
 @click.option(
     "--folder",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     metavar="DIR",
     help="Of inertial, in place of --out: an EuRoC folder, which `replay` reads.",
 )

@@ -44,6 +44,8 @@ _USAGE_CODES = (
 )  # fmt: skip
 # Of what was typed, where the command itself finds it; a service says the same of what is in a file.
 _TYPED_CODES = ("bad_information", "bad_loss", "bad_shape", "not_finite")
+# Of what a command reads itself; a service refuses what needs a journal that it cannot read.
+_READ_CODES = ("journal_unreadable",)
 _UNAVAILABLE_CODES = ("unavailable", "shutting_down", "other_protocol")
 
 
@@ -115,7 +117,7 @@ def _exit_code(error: Exception, code: str) -> int:
         return error.exit_code
     if not hasattr(error, "code"):
         return FAILED
-    if code == "bad_file":
+    if code == "bad_file" or (code in _READ_CODES and not isinstance(error, Refused)):
         return BAD_FILE
     if code in _USAGE_CODES or (code in _TYPED_CODES and not isinstance(error, Refused)):
         return USAGE

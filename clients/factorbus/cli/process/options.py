@@ -16,6 +16,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 USUAL_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_ENDPOINT = os.environ.get("FACTORBUS_ENDPOINT") or USUAL_ENDPOINT
 PAGE_HOST = "127.0.0.1"  # where a page for browsers is served, without an address of its own
+# Who reads or writes a path says what is wrong with it, with the exit code of that: click's own would say wrong use.
+PATH = click.Path(path_type=Path, readable=False)
+FOLDER = click.Path(path_type=Path, readable=False, file_okay=False)
 # The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
 MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch", "bayes-tree")
 # The endings of pictures; `tests/clients/test_cli_files.py` holds them to those of `factorbus.viz`.
@@ -138,7 +141,7 @@ def asks_map(command: F) -> F:
 
 def file_argument(name: str) -> Callable[[F], F]:
     """A path that is checked by who reads it, so that a bad one has the exit code of a bad file."""
-    return click.argument(name, type=click.Path(path_type=Path))
+    return click.argument(name, type=PATH)
 
 
 def out_option(flag: str, name: str, text: str, metavar: str) -> Callable[[F], F]:
@@ -156,7 +159,7 @@ def out_option(flag: str, name: str, text: str, metavar: str) -> Callable[[F], F
             raise click.BadParameter(f"{path} does not end in {' or '.join(endings)}", param=parameter)
         return checked_output(ctx, parameter, path)
 
-    return click.option(flag, name, type=click.Path(path_type=Path), callback=checked, metavar=metavar, help=text)
+    return click.option(flag, name, type=PATH, callback=checked, metavar=metavar, help=text)
 
 
 def checked_output(_ctx: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
@@ -194,7 +197,7 @@ def journal_option(command: F) -> F:
     return click.option(
         "--journal",
         "folder",
-        type=click.Path(path_type=Path),
+        type=PATH,
         required=True,
         metavar="DIR",
         help="The folder that `factorbus serve` has.",

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import input_file, require
+from factorbus.cli.process.options import PATH
 
 # A clock of the robot's is not looked at; every file of a simulated robot has it.
 _WITHOUT_EFFECT = ("use_sim_time",)
@@ -79,6 +80,6 @@ def _as_typed(path: Path, option: click.Parameter, name: str, value: Any) -> Any
 def params_file_option(command: Any) -> Any:
     """--params-file, which `NodeCommand` reads."""
     return click.option(
-        "--params-file", type=click.Path(path_type=Path), metavar="FILE.yaml", expose_value=False,
+        "--params-file", type=PATH, metavar="FILE.yaml", expose_value=False,
         help="Options from a parameters file of ROS 2, such as pose_graph: /graph; what is typed counts first.",
     )(command)  # fmt: skip

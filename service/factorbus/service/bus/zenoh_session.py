@@ -17,14 +17,14 @@ from zenoh.handlers import Callback
 from factorbus.proto import codec, keys, redact
 from factorbus.proto.messages import Job
 from factorbus.proto.ports import check_endpoints
-from factorbus.proto.problems import Problem, Unavailable
+from factorbus.proto.problems import BadConfigurationFile, Problem, Unavailable
+from factorbus.proto.zenoh_file import check_zenoh_file
 from factorbus.service.bus.bind_address_check import refuse_exposed
 from factorbus.service.bus.key_files import refuse_unsafe_keys
 from factorbus.service.bus.zenoh_config import RUNTIME, RUNTIME_VARIABLE, upstream_settings, zenoh_settings
 from factorbus.service.config import BadConfig, Config
 from factorbus.service.core.events import Asker
 from factorbus.service.jobs.job_check import WrongAnswer
-from factorbus.wording.unreadable import is_device
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ _PRIORITY = {
 
 
 def check_zenoh_files(config: Config) -> None:
-    """Before anything is compiled, and an upstream tried again and again.  Raises BadConfig, as `open_service_bus`."""
+    """Before anything is compiled, and an upstream tried again and again.  Raises as `open_service_bus`."""
     _service_settings(config)
     if config.upstream:
         settings = _upstream_settings(config.upstream, config.upstream_zenoh)
@@ -53,8 +53,8 @@ def check_listening(config: Config) -> None:
 
 
 def open_service_bus(config: Config) -> "ServiceBus":
-    """The bus as `config` describes it.  Raises BadConfig; Exposed and UnsafeKeys are such.  Raises PortTaken,
-    CannotListen.
+    """The bus as `config` describes it.  Raises BadConfig; Exposed and UnsafeKeys are such.  Raises
+    BadConfigurationFile, PortTaken, CannotListen.
     """
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)  # read by Zenoh when the first session of a process is opened
     settings = _service_settings(config)
@@ -82,14 +82,17 @@ def _upstream_settings(endpoint: str, zenoh_file: str) -> zenoh.Config:
 
 
 def _settings(file: str, ours: Mapping[str, Any]) -> zenoh.Config:
-    if file and is_device(file):
-        raise BadConfig(f"the Zenoh configuration {file} is a device; wanted a file")
+    if file:
+        check_zenoh_file(file)
     try:
         settings = zenoh.Config.from_file(file) if file else zenoh.Config()
+    except zenoh.ZError as error:
+        # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
+        raise BadConfigurationFile(file, redact.reason(error)) from None
+    try:
         for path, value in ours.items():
             settings.insert_json5(path, json.dumps(value))
     except zenoh.ZError as error:
-        # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
         where = file or "built in"
         raise BadConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
     return settings
