@@ -234,8 +234,15 @@ def test_the_client_library_does_its_part_in_every_role(secured: Secured, hub: s
     with connect(hub, client="robot2", zenoh=secured.clients["robot1"], timeout_s=1) as bus:
         with pytest.raises(Unavailable, match="nobody replies"):  # another's name under one's own certificate
             bus.map("kitchen", create=False, mirror=False).insert(Draft())
-        with pytest.raises(Unavailable):
+        with pytest.raises(Unavailable, match=r"may this client create maps\?.* create=False \(access control drops"):
             bus.map("kitchen")  # a front end does not create maps
+        with pytest.raises(Unavailable, match=r"may this client do that, which is an operator's\? \(access control"):
+            bus.drop("kitchen")
+    with connect(hub, client="wall", zenoh=secured.clients["wall"], timeout_s=1) as bus:
+        with pytest.raises(Unavailable, match="may this client insert"):
+            bus.map("kitchen", create=False, mirror=False).insert(Draft())
+        with pytest.raises(Unavailable, match=r"nobody replies: is it running, and may this client ask\?"):
+            bus.maps()
 
 
 def test_strangers_do_not_get_in(secured: Secured, hub: str, tmp_path: Path) -> None:

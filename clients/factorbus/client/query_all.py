@@ -4,7 +4,7 @@ import time
 from queue import SimpleQueue
 
 from factorbus.client.link import Link
-from factorbus.client.replies import Again, Reply, Silence, interpret_reply
+from factorbus.client.replies import NOBODY, Again, Reply, Silence, interpret_reply, why_silent
 from factorbus.client.versions import refuse_other_protocol
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Problem, Unavailable
@@ -35,5 +35,4 @@ def query_all(link: Link, operation: str, timeout_s: float) -> list[bytes]:
         pauses = [verdict.pause_s for verdict in verdicts if isinstance(verdict, Again)]
         # No event tells that a service is free again: a busy one has said for how long it is, and we wait that long.
         time.sleep(min(max(pauses), max(end - time.monotonic(), 0.0)))
-    hint = "nobody replies: is it running, and may this client ask?"
-    raise Unavailable(what, timeout_s, hint)
+    raise Unavailable(what, timeout_s, f"{NOBODY}: {why_silent(key)}")

@@ -1,18 +1,22 @@
 """What can come of asking somebody on the bus, and what to make of it.  Pure.
 
 Silence (no reply at all) has four causes that look the same: nobody owns the key, access control said no, the
-message was over a limit of the bus, or the service died.  So it is asked again, with the same sequence number.
+message was over a limit of the bus, or the service died.  So it is asked again, with the same sequence number, and
+in the end all that may be said is `why_silent`.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from factorbus.proto import keys
 from factorbus.proto.codec import decode_problem
 from factorbus.proto.problems import Problem, Refused
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 1.0
 _DEFAULT_BUSY_S = 0.05
+NOBODY = "nobody replies"
+_LISTS = (keys.admin_key("maps"), keys.admin_key("stats"))
 # These do not use up an insert's number, and say when to come back.
 _WAIT = frozenset({"busy", "journal_failed"})
 
@@ -63,11 +67,22 @@ def interpret_reply(
         case AnswerReply(payload):
             return payload
         case Silence():
-            return Again(pause(attempt), "nobody replies")
+            return Again(pause(attempt), NOBODY)
         case TimedOut():
             return Again(0.0, "the service has the message and has not answered yet")
         case Failure(payload):
             return _judge_failure(payload, attempt, passing)
+
+
+def why_silent(key: str) -> str:
+    """What to look at where nobody replies on `key`: who keeps it, and whether this client is one that may use it."""
+    if key == keys.admin_key("create"):
+        do = "create maps? One that may not joins a map that is there, in Python with create=False"
+    elif key.startswith(keys.admin_key("")) and key not in _LISTS:
+        do = "do that, which is an operator's?"
+    else:
+        do = "insert under this name?" if "/in/" in key else "ask?"
+    return f"is it running, and may this client {do} (access control drops what it denies without a word)"
 
 
 def pause(attempt: int) -> float:

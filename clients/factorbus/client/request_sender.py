@@ -16,7 +16,7 @@ from typing import Any
 
 from factorbus.client.interruptible_future import InterruptibleFuture
 from factorbus.client.link import Link
-from factorbus.client.replies import Again, Reply, Silence, interpret_reply
+from factorbus.client.replies import NOBODY, Again, Reply, Silence, interpret_reply, why_silent
 from factorbus.client.versions import LOOK_S, other_protocol
 from factorbus.proto.problems import ClosedHere, Problem, Refused, Unavailable
 from factorbus.wording import counted
@@ -134,6 +134,8 @@ class RequestSender:
     def _put_back(self, request: Request, again: Again) -> None:
         sent = f"{counted(len(request.payload), 'byte')} sent, {counted(request.attempt, 'try', 'tries')}"
         request.because = f"{again.because} on {request.key} ({sent})"
+        if again.because == NOBODY:
+            request.because += f": {why_silent(request.key)}"
         at = time.monotonic() + again.pause_s
         if request.deadline is not None and at >= request.deadline:
             self._finish(request, Unavailable(request.what, self._waited(request), request.because))
