@@ -110,7 +110,9 @@ def test_too_many_levels_groups_or_elements_are_too_large(data: bytes, size: int
 
 
 def test_a_kind_that_is_not_known_is_refused_in_an_insert() -> None:
-    with pytest.raises(UnknownKind, match="'sim2' is not known here; wanted one of se2, se3") as caught:
+    with pytest.raises(
+        UnknownKind, match="'sim2' is not known here; did you mean 'sim3'\\?; wanted one of se2, se3"
+    ) as caught:
         codec.decode_insert(msgpack.packb({"sequence": 1, "variables": [GROUP | {"kind": "sim2"}]}))
     assert (caught.value.code, caught.value.detail["kind"]) == ("unknown_kind", "sim2")
     with pytest.raises(UnknownKind, match="between_se9"):
