@@ -54,6 +54,7 @@ COMMANDS = {
 _HIDDEN = ("robot",)
 _GROUPS = ("ask", "change", "plot", "journal", "datasets")  # commands that have commands
 _NOT_REACHED = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM)
+_ROOM = "make room where it goes, or send it elsewhere"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 _EPILOG = """\b
@@ -122,6 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             document({"problem": {"code": "bad_usage", "message": error.format_message(), "detail": _detail(error)}})
         if hint := _hint(error):
             click.echo(hint, err=True)
+        click.echo("[bad_usage]", err=True)
         return USAGE
     except (KeyboardInterrupt, click.Abort):
         click.echo("interrupted", err=True)
@@ -136,7 +138,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.errno not in _FULL or error.filename is not None:
             return report(error, as_json=as_json, debug=debug)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return report(Stopped("cannot_write", f"standard output cannot be written: {error.strerror}"), False, debug)
+        return report(
+            Stopped("cannot_write", f"standard output cannot be written: {error.strerror}; {_ROOM}"), False, debug
+        )
     except Exception as error:
         return report(error, as_json=as_json, debug=debug)
 

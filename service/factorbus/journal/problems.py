@@ -152,5 +152,5 @@ class NoJournal(Problem):
     code = "no_journal"
 
     def __init__(self, where: Path, known: tuple[str, ...] = ()) -> None:
-        there = f"; there are {', '.join(known)}" if known else ""
+        there = f"; there are {', '.join(known)}" if known else "; name the folder that `factorbus serve --journal` has"
         super().__init__(f"there is no journal {where}{there}", known=known)

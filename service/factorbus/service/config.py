@@ -151,9 +151,15 @@ def checked_config(config: Config) -> Config:
     if config.mode not in ("peer", "router", "client"):
         raise BadConfig(f"mode is {config.mode!r}; wanted peer, router or client")
     if config.mode == "client" and not config.connect:
-        raise BadConfig("mode is 'client' and there is nothing to connect to; give connect = [\"tcp/HOST:7447\"]")
+        raise BadConfig(
+            "mode is 'client' and there is nothing to connect to; give "
+            '--connect ENDPOINT, in a file connect = ["tcp/HOST:7447"]'
+        )
     if config.mode != "client" and not config.listen and not config.connect:
-        raise BadConfig('there is nothing to listen on or connect to; give listen = ["tcp/127.0.0.1:7447"]')
+        raise BadConfig(
+            "there is nothing to listen on or connect to; give "
+            '--listen ENDPOINT, in a file listen = ["tcp/127.0.0.1:7447"]'
+        )
     for name in (f.name for f in fields(Limits)):
         least = 0 if name in _MAY_BE_0 else 1e-9
         if getattr(config.limits, name) < least:
@@ -180,9 +186,14 @@ def checked_config(config: Config) -> Config:
     if config.durability not in DURABILITIES:
         raise BadConfig(f"durability is {config.durability!r}; wanted {', '.join(DURABILITIES)}")
     if config.standby and not config.journal:
-        raise BadConfig("standby without a journal: there is nothing to take over; give journal = DIR")
+        raise BadConfig(
+            'standby without a journal: there is nothing to take over; give --journal DIR, in a file journal = "DIR"'
+        )
     if config.upstream and not config.journal:
-        raise BadConfig("upstream without a journal: what upstream does not have yet is kept in it; give journal = DIR")
+        raise BadConfig(
+            "upstream without a journal: what upstream does not have yet is kept in it; "
+            'give --journal DIR, in a file journal = "DIR"'
+        )
     if (
         config.upstream
         and config.mode != "client"
@@ -192,7 +203,9 @@ def checked_config(config: Config) -> Config:
             f"upstream is {config.upstream}, where this service listens: that is itself; give another one's"
         )
     if config.upstream_zenoh and not config.upstream:
-        raise BadConfig('upstream_zenoh without an upstream; give upstream = "tcp/HOST:7447"')
+        raise BadConfig(
+            'upstream_zenoh without an upstream; give --upstream ENDPOINT, in a file upstream = "tcp/HOST:7447"'
+        )
     usual = Config()
     for name in ("durability", "group_s", "checkpoint_s"):
         if getattr(config, name) != getattr(usual, name) and not config.journal:
@@ -212,7 +225,9 @@ def _at_this_host(endpoint: str) -> str:
 
 def needs_journal(name: str) -> BadConfig:
     """`name` is set, and there is no journal that it could be of."""
-    return BadConfig(f"{name} without a journal: maps end with the service; give journal = DIR")
+    return BadConfig(
+        f'{name} without a journal: maps end with the service; give --journal DIR, in a file journal = "DIR"'
+    )
 
 
 def _build(kind: type, content: Mapping[str, Any], where: str) -> Any:

@@ -91,7 +91,8 @@ def output_file(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise Stopped("cannot_write", f"{path} cannot be written: {error.strerror}", path=str(path)) from error
+        told = f"{path} cannot be written: {error.strerror}; make room there, or name a file where this user may write"
+        raise Stopped("cannot_write", told, path=str(path)) from error
 
 
 def require(extra: str, what: str) -> None:
