@@ -107,7 +107,10 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, capsys: pytest.C
         capsys.readouterr()
         assert main(arguments) == FAILED, arguments
         said = capsys.readouterr().err.splitlines()[-1]
-        assert said == f"factorbus: {arguments[-1]} cannot be written: No space left on device [cannot_write]"
+        assert said.startswith(
+            f"factorbus: {arguments[-1]} cannot be written: No space left on device; make room there"
+        )
+        assert said.endswith("[cannot_write]")
 
 
 def test_standard_output_that_is_full_is_said() -> None:
@@ -115,7 +118,8 @@ def test_standard_output_that_is_full_is_said() -> None:
         ran = typed("version", stdout=full)
     assert (ran.returncode, ran.stderr) == (
         FAILED,
-        "factorbus: standard output cannot be written: No space left on device [cannot_write]\n",
+        "factorbus: standard output cannot be written: No space left on device; "
+        "make room where it goes, or send it elsewhere [cannot_write]\n",
     )
 
 
@@ -194,3 +198,19 @@ def test_a_graph_without_values_says_what_has_them(tmp_path: Path, capsys: pytes
         assert f"solve it first, as `factorbus replay FILE --{form} OUT` does" in capsys.readouterr().err
     assert main(["replay", str(source), "--in-process"]) == OK
     assert re.search(r"^ *fixed +x0 *$", capsys.readouterr().out, re.M)
+
+
+@pytest.mark.parametrize("arguments", [["save", "m", "o.foo"], ["replay", "a.g2o", "--every", "-1"], ["nonsense"]])
+def test_wrong_use_has_its_code_in_text(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == USAGE
+    assert capsys.readouterr().err.endswith("[bad_usage]\n")
+
+
+def test_a_setting_is_named_as_the_option_and_as_in_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", "--no-warm", "--standby"]) == USAGE
+    assert 'give --journal DIR, in a file journal = "DIR"' in capsys.readouterr().err
+
+
+def test_a_journal_that_is_not_there_has_a_next_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["journal", "show", "--journal", str(tmp_path / "none")])
+    assert "name the folder that `factorbus serve --journal` has [no_journal]" in capsys.readouterr().err

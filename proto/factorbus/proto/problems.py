@@ -42,7 +42,7 @@ The solver's own errors (unknown_variable, not_positive_definite, underconstrain
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
-from factorbus.proto.nearest import nearest
+from factorbus.proto.nearest import few_of, largest_of, nearest
 from factorbus.wording.picklable import Picklable
 
 Raised = TypeVar("Raised", bound=Exception)
@@ -157,29 +157,12 @@ class BadOption(BadMessage):
     code = "bad_option"
 
 
-_MOST_LISTED = 16  # kinds in one text
-
-
-def _few_of(kind: str, known: tuple[str, ...]) -> str:
-    """Of many kinds those that join the same kind of variable, by the end of the name, and where all of them are."""
-    end = f"_{kind.rpartition('_')[2]}"
-    same = [name for name in known if name.endswith(end)]
-    return f"{', '.join(same[:_MOST_LISTED])}{', ... ' if same else ''}those that `factorbus kinds` lists"
-
-
-def _largest_of(kind: str, known: tuple[str, ...]) -> str:
-    """Of a size that there is not, as vector10, the largest that there is."""
-    stem = kind.rstrip("0123456789")
-    sizes = [int(name[len(stem) :]) for name in known if name.startswith(stem) and name[len(stem) :].isdecimal()]
-    return f"; {stem}{max(sizes)} is the largest" if stem != kind and len(sizes) > 3 else ""
-
-
 class UnknownKind(BadMessage):
     code = "unknown_kind"
 
     def __init__(self, where: str, kind: str, known: tuple[str, ...], also: str = "") -> None:
-        meant = _largest_of(kind, known) or nearest(kind[:64], filter(str.isidentifier, known))
-        listed = ", ".join(known) if len(known) <= _MOST_LISTED else _few_of(kind, known)
+        meant = largest_of(kind, known) or nearest(kind[:64], filter(str.isidentifier, known))
+        listed = few_of(kind, known)
         super().__init__(where, f"kind {kind[:64]!r} is not known here{meant}", f"one of {listed}{also}")
         self.detail["kind"] = kind[:64]
 

@@ -51,8 +51,19 @@ def show(names: tuple[str, ...], folder: Path, as_json: bool) -> int:
         screen.document({"maps": rows})
     for row in () if as_json else rows:
         cells = [("does not open", row["code"])] if "code" in row else list(row.items())[1:]
-        screen.table([(key, str(value)) for key, value in cells], title=row["map"])
+        screen.table([(key, _in_words(value)) for key, value in cells], title=row["map"])
     return code
+
+
+def _in_words(value: Any) -> str:
+    """A value of a row as a person reads it: lists with commas, the parts of a build by name."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ("; " if any(isinstance(each, dict) for each in value) else ", ").join(map(_in_words, value)) or "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_in_words(each)}" for name, each in value.items())
+    return "none" if value in (None, "") else str(value)
 
 
 def _row(store: Any) -> dict[str, Any]:
