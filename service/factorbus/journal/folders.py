@@ -22,7 +22,7 @@ def maps_in(folder: Path, file: str, known: Container[str] = ()) -> list[str]:
     try:
         return _maps_in(folder, file, known)
     except PermissionError as error:
-        raise JournalUnreadable(folder, error.strerror) from None
+        raise JournalUnreadable(folder, error.strerror or str(error)) from None
 
 
 def _maps_in(folder: Path, file: str, known: Container[str]) -> list[str]:

@@ -351,7 +351,7 @@ def open_store(folder: Path, durability: str = "commit", read_only: bool = False
     try:
         there = path.is_file()
     except PermissionError as error:
-        raise JournalUnreadable(path, error.strerror) from None
+        raise JournalUnreadable(path, error.strerror or str(error)) from None
     if not there:
         raise NoJournal(path)
     if path.is_symlink():
