@@ -214,7 +214,7 @@ def test_an_import_of_a_file_that_no_map_can_be_named_after_says_how_it_gets_a_n
     said = " ".join(capsys.readouterr().err.split())
     assert code == USAGE, said
     assert "my hall.fbmap has a name that no map can have; wanted a name of 1 to 64 of the characters" in said
-    assert said.endswith("--as MAP gives it one")
+    assert said.endswith("--as MAP gives it one [bad_usage]")
 
 
 def test_files_of_the_folder_one_is_in_are_neither_run_nor_in_the_way(tmp_path: Path) -> None:

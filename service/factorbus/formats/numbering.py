@@ -32,17 +32,17 @@ def numbered(batch: Batch, ids: str, left: LeftOut) -> tuple[I64, I64]:
     shared = len(np.unique(numbers)) < len(numbers)
     if ids == "auto":
         ids = "ids" if are_usual and not shared else "keys"
-        if ids == "keys" and (keys > MAX_INDEX).any():
-            left.say(
-                "ids are keys as GTSAM packs its symbols: reading gives the same keys; g2o's own programs want smaller "
-                'ones, which "counted" gives'
-            )
     if ids == "apart" and not (shared and are_usual and _is_apart(batch, numbers)):
         ids = "ids" if are_usual and not shared else "keys"
     if ids == "ids" and not (are_usual and not shared):
         raise FormatError("g2o", None, "keys that their numbers do not tell apart", 'ids "auto", "keys" or "counted"')
     if ids == "keys":
-        if len(keys) and (keys <= MAX_INDEX).all():
+        if (keys > MAX_INDEX).any():
+            left.say(
+                "ids are keys as GTSAM packs its symbols: reading gives the same keys; g2o's own programs want smaller "
+                'ones, which "counted" gives'
+            )
+        elif len(keys):
             left.say("no key has a letter, and a file of such ids says none: reading gives poses x and points l")
         return _as_keys(keys[order])
     return keys[order], numbers[order]

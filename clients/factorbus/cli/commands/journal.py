@@ -36,7 +36,8 @@ def command() -> None:
 @journal_option
 @json_option
 def show(names: tuple[str, ...], folder: Path, as_json: bool) -> int:
-    """What there is of MAP, or of every map. One that does not open hides no other; the exit code is then 5."""
+    """What there is of MAP, or of every map. One that does not open hides no other; the exit code is then 5, or 3 where
+    it may not be read."""
     from factorbus.proto.problems import Problem
 
     rows, code = list[dict[str, Any]](), OK
