@@ -155,6 +155,18 @@ def test_leaving_says_what_was_refused_and_nobody_has_looked_at(service: Service
     bus.close()
 
 
+def test_a_bus_that_is_closed_says_what_all_of_its_maps_refused(service: Service) -> None:
+    bus = connect(service.endpoint, client="of-several", timeout_s=60)
+    for number in range(3):
+        joined = bus.map(f"several-{number}")
+        joined.insert(start())
+        joined.send(step(3 + number)).request.future.exception(60)
+    with pytest.raises(Refused, match="x2") as caught:
+        bus.close()
+    assert [str(other).count(f"x{2 + k}") > 0 for k, other in enumerate(caught.value.others, 1)] == [True, True]
+    bus.close()
+
+
 def test_leaving_after_an_error_raises_that_error(service: Service) -> None:
     def fail() -> None:
         with connect(service.endpoint, client="failing", timeout_s=60) as bus:

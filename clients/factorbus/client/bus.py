@@ -2,7 +2,6 @@
 
 import secrets
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from numbers import Integral
 from os import PathLike
 from typing import Any
@@ -12,6 +11,7 @@ from factorbus.client.features import Features
 from factorbus.client.link import Link, open_link
 from factorbus.client.map import SUFFIX_LENGTH, Map
 from factorbus.client.map_row import MapRow
+from factorbus.client.pending_insert import raise_unseen
 from factorbus.client.permission import inserts_pass
 from factorbus.client.query_all import query_all
 from factorbus.client.request_sender import Request, RequestSender
@@ -248,15 +248,14 @@ class Bus:
     def close(self, *, quietly: bool = False) -> None:
         """Leave all maps and the bus.  What is unanswered fails with Unavailable.
 
-        Unless quietly it raises, of the first map that has one, what `Map.close` raises.
+        Unless quietly it raises as `Map.close`, of all maps together, when all is closed.
         """
-        with ExitStack() as leaving:  # all are left, whatever one of them raises
-            leaving.callback(self._link.close)
-            leaving.callback(self._sender.close)
-            for opened in reversed(self._features):
-                leaving.callback(opened.close)
-            for joined in reversed(self._maps):
-                leaving.callback(joined.close, quietly=quietly)
+        refused = [each for joined in self._maps for each in joined.close(quietly=True)]
+        for front in self._features:
+            front.close()
+        self._sender.close()
+        self._link.close()
+        raise_unseen([] if quietly else refused)
 
     def _existing(self, name: str) -> MapRow:
         """As the map tells of itself: who may only ask a map need not be allowed to list all of them."""

@@ -194,8 +194,7 @@ class Map:
     def flush(self, timeout_s: float | None = None) -> None:
         """Wait until everything sent is answered, and the mirror has it.
 
-        Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`, whose
-        `others` are the further ones.
+        Raises Unavailable when time is up, and the first refusal that nobody has looked at, with its `others`.
         """
         timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         with self._lock:
@@ -305,20 +304,22 @@ class Map:
         """
         return logged(self.name, self.ask.export(format, timeout_s, robot, strict, ids).result())
 
-    def close(self, *, quietly: bool = False) -> None:
-        """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait.  Unless
-        quietly it raises the first refusal, or insert without an answer, that nobody has looked at.
+    def close(self, *, quietly: bool = False) -> list[tuple[PendingInsert, Problem]]:
+        """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait.  Raises
+        the first refusal, or insert without an answer, that nobody has looked at; quietly it gives all there are.
         """
         with self._lock:
             already, self._closed = self._closed, True
             self._changed.notify_all()
-        if not already:
-            with self._sending:
-                self._give_up("the map was closed first")
-            self._presence.close()
-            self._stack.close()
-            if not quietly:
-                raise_unseen(self._window.take_refused())
+        if already:
+            return []
+        with self._sending:
+            self._give_up("the map was closed first")
+        self._presence.close()
+        self._stack.close()
+        refused = self._window.take_refused()
+        raise_unseen([] if quietly else refused)
+        return refused
 
     def open_mirror(self, interest: Interest | None = None) -> None:
         """Start the live estimate, or that of a part, and wait for it.  Raises Unavailable, NotSupported, Refused."""
@@ -339,8 +340,7 @@ class Map:
     def _enter(self, row: MapRow) -> None:
         """Take part in the map as `row` describes it, under a name of our own.
 
-        The suffix makes the name that of one run of one handle: sequence numbers start at 1 for a new name, and
-        two processes that use the same name by mistake do not answer for each other.
+        The suffix makes the name that of one handle, of which numbers start at 1, though processes may have one name.
         """
         self.name, self.mode, self.epoch, self.closures = row.name, row.mode, row.epoch, row.closures
         self._row, self._protocol = row, row.protocol
@@ -365,9 +365,9 @@ class Map:
             wanted = refused.detail.get("next")
             return refused.code == "bad_sequence" and type(wanted) is int and window.waits_for(insert.sequence, wanted)
 
-        sent, read = encoded(insert), reading_ids(order)
-        request = Request(f"map {self.name!r}", self._key, sent, read, passing=passing, then=then)
-        return PendingInsert(request, insert.sequence, timeout_s)
+        what, read = f"map {self.name!r}", reading_ids(order)
+        sent = Request(what, self._key, encoded(insert), read, passing=passing, then=then)
+        return PendingInsert(sent, insert.sequence, timeout_s)
 
     def _catch_up(self, timeout_s: float) -> None:
         """Let the mirror reach what has been accepted; if it does not, it says that it is stale."""
