@@ -18,7 +18,8 @@ def few_of(kind: str, known: tuple[str, ...]) -> str:
         return ", ".join(known)
     end = f"_{kind.rpartition('_')[2]}"
     same = [name for name in known if name.endswith(end)]
-    return f"{', '.join(same[:_MOST_LISTED])}{', ... ' if same else ''}those that `factorbus kinds` lists"
+    listed = f"{', '.join(same[:_MOST_LISTED])}{', ... ' if same else ''}those that `factorbus kinds` lists"
+    return ", ".join([listed, *(name for name in known if not name.isidentifier())])  # such as "or a formula"
 
 
 def largest_of(kind: str, known: tuple[str, ...]) -> str:
