@@ -108,8 +108,9 @@ def test_a_full_window_blocks_and_says_so(start: Callable[..., Service], endpoin
         assert caught.value.pending_insert is first
         with pytest.raises(Unavailable, match="2 inserts without an answer"):
             kitchen.flush(0.05)
-        with pytest.raises(Unavailable, match="closed first"):
+        with pytest.raises(Unavailable, match="closed first") as closing:
             kitchen.close()
+        assert not closing.value.others  # that the first one had no answer was said before
         with pytest.raises(Unavailable, match="closed first"):
             first.result()
         with pytest.raises(Unavailable, match="open it again"):

@@ -20,6 +20,7 @@ class PendingInsert:
         self.request = request
         self.sequence = sequence
         self.seen = False
+        self.waited_for = False  # in vain, which was said
         self._timeout_s = timeout_s
 
     @property
@@ -47,13 +48,20 @@ class PendingInsert:
         try:
             return self.future.result(timeout_s)
         except TimeoutError:
-            self.seen = False
+            self.seen, self.waited_for = False, True
             raise NoAnswerYet(self, timeout_s) from None
 
 
 def raise_unseen(refused: Sequence[tuple[PendingInsert, Problem]]) -> None:
-    """Raises the first refusal of an insert whose answer nobody has looked at; the further ones are its `others`."""
-    unseen = [refusal for pending_insert, refusal in refused if not pending_insert.seen]
+    """Raises the first refusal of an insert whose answer nobody has looked at; the further ones are its `others`.
+
+    Of one that was waited for in vain it is known that there was no answer.
+    """
+    unseen = [
+        refusal
+        for pending_insert, refusal in refused
+        if not (pending_insert.seen or (pending_insert.waited_for and isinstance(refusal, Unavailable)))
+    ]
     if not unseen:
         return
     first, *others = unseen
