@@ -1,4 +1,4 @@
-"""What is refused for being just outside its range is told with a number that is outside of it."""
+"""A number that is refused for being just outside its range is printed with the digits that show it."""
 
 import re
 from collections.abc import Callable

@@ -16,16 +16,18 @@ LETTERS = {"x": "y"}
 KIND, SIGMAS = "se2", SEEN["se2"].tolist()
 
 
-def drafted(candidates: list[Candidate], turned: bool = False) -> Draft:
+def drafted(candidates: list[Candidate], turned: bool = False, mixed: bool = False) -> Draft:
+    """mixed: every other one has a loss, so that a message has them in another order."""
     draft = Draft()
-    for each in candidates:
+    for k, each in enumerate(candidates):
         T = pose_matrix(each.z)
         z = each.z
         if turned:
             T = np.linalg.inv(T)
             z = np.array([*T[:2, 2], np.arctan2(T[1, 0], T[0, 0])])
         pair = [f"x{each.a}", f"y{each.b}"]
-        draft.factor(f"between_{KIND}", pair[::-1] if turned else pair, z, sigmas=SIGMAS)
+        loss = "huber" if mixed and k % 2 == 0 else None
+        draft.factor(f"between_{KIND}", pair[::-1] if turned else pair, z, sigmas=SIGMAS, loss=loss)
     return draft
 
 
@@ -58,6 +60,10 @@ def test_two_maps_become_one(endpoint: str) -> None:
         turned = align(hall, yard, drafted(candidates, turned=True), letters=LETTERS)
         assert turned.frame is not None
         assert turned.agree.tolist() == found.agree.tolist()
+        mixed = align(hall, yard, drafted(candidates, mixed=True), letters=LETTERS)
+        assert (mixed.agree.tolist(), mixed.reference) == (found.agree.tolist(), found.reference)
+        pairs = [{tuple(ends) for g in each.anchors().factors for ends in g.keys.tolist()} for each in (found, mixed)]
+        assert pairs[0] == pairs[1]
         # Their sigmas are along the axes of the other pose then.
         np.testing.assert_allclose(turned.frame, found.frame, atol=0.2)
         hall.merge(yard, anchors=found.anchors(), letters=LETTERS, settle=True)

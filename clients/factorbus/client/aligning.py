@@ -30,6 +30,7 @@ from factorbus.client.alignment import (
     judge,
 )
 from factorbus.client.arguments import of_type
+from factorbus.client.call_order import call_order
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.frames import matrix_of_pose, pose_of_matrix
 from factorbus.client.map import Map
@@ -66,8 +67,9 @@ class Alignment:
     verdict: "aligned", "ambiguous" or "too_few" (that agree).  frame: T_a_b, x y θ or x y z qx qy qz qw, by the largest
     set; None where no two candidates agree.  reference: the candidate in its midst.  covariance (d, d): of the other's
     pose of that candidate as seen from this map's, in its tangent space, metres and radians.
-    agree, rival: which candidates the largest set has, and the largest one of the others.  by_chance: how many sets
-    like the largest are expected among false candidates.
+    agree, rival: which candidates the largest set has, and the largest one of the others, by their numbers, which are
+    in the order in which they were drafted.  by_chance: how many sets like the largest are expected among false ones.
+    numbers: of each of `candidates`, which a draft has by loss.
     """
 
     verdict: str
@@ -78,6 +80,7 @@ class Alignment:
     rival: I64
     by_chance: float
     candidates: Batch
+    numbers: I64
     said: str
 
     def __str__(self) -> str:
@@ -91,7 +94,8 @@ class Alignment:
             )
         if self.verdict != ALIGNED:
             raise NotAligned(f"{self.said}; nothing has changed. Give more candidates, at places far from each other")
-        return Batch((), tuple(pick_factors(g, np.isin(rows, self.agree)) for g, rows in _numbered(self.candidates)))
+        agrees = np.isin(self.numbers, self.agree)
+        return Batch((), tuple(pick_factors(group, agrees[rows]) for group, rows in _numbered(self.candidates)))
 
 
 def align(
@@ -118,7 +122,7 @@ def align(
         Side(here, _poses(here.ask_estimate(timeout_s=timeout_s).variables, {}, kind)),
         Side(other, _poses(other.ask_estimate(timeout_s=timeout_s).variables, named, kind)),
     )
-    return align_sides(*sides, given, timeout_s)
+    return align_sides(*sides, given, call_order(candidates), timeout_s)
 
 
 class Side(NamedTuple):
@@ -133,8 +137,8 @@ def side_of(of: Map, variables: Sequence[Variables], kind: str) -> Side:
     return Side(of, _poses(variables, {}, kind))
 
 
-def align_sides(here: Side, there: Side, given: Batch, timeout_s: float | None) -> Alignment:
-    """Where the frame of `there` lies in that of `here`.  Raises as `align` does."""
+def align_sides(here: Side, there: Side, given: Batch, order: Sequence[int], timeout_s: float | None) -> Alignment:
+    """Where the frame of `there` lies in that of `here`; order: see `call_order`.  Raises as `align` does."""
     kind = kind_of_candidates(given)
     ends = [_ends(kind, pair, here.poses, there.poses) for group in given.factors for pair in group.keys.tolist()]
     of_a, of_b = [here.poses[a] for a, *_ in ends], [there.poses[b] for _, b, _ in ends]
@@ -149,7 +153,7 @@ def align_sides(here: Side, there: Side, given: Batch, timeout_s: float | None) 
         _joint(there.map, [of_b[k][0] for k in kept], timeout_s),
         np.array([ends[k][:2] for k in kept]),
     )
-    return _alignment(judge(known), given, np.array(kept))
+    return _alignment(judge(known), given, np.array(kept), np.argsort(order))
 
 
 def kind_of_candidates(given: Batch) -> str:
@@ -247,7 +251,7 @@ def _joint(of: Map, keys: list[int], timeout_s: float | None) -> F64:
     return whole[np.ix_(rows, rows)]
 
 
-def _alignment(found: Judgement, given: Batch, kept: I64) -> Alignment:
+def _alignment(found: Judgement, given: Batch, kept: I64, numbers: I64) -> Alignment:
     best, rival = found.best, found.rival
     nobody = np.empty(0, np.int64)
     said, copies = _sentence(found, kept.size), given.factor_count - kept.size
@@ -256,12 +260,13 @@ def _alignment(found: Judgement, given: Batch, kept: I64) -> Alignment:
     return Alignment(
         found.verdict,
         None if best is None else pose_of_matrix(best.T),
-        None if best is None else int(kept[best.reference]),
+        None if best is None else int(numbers[kept[best.reference]]),
         None if best is None else best.covariance,
-        nobody if best is None else kept[best.members],
-        nobody if rival is None else kept[rival.members],
+        nobody if best is None else np.sort(numbers[kept[best.members]]),
+        nobody if rival is None else np.sort(numbers[kept[rival.members]]),
         math.inf if best is None else best.by_chance,
         given,
+        numbers,
         said,
     )
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from factorbus.client.aligning import ALIGNED, Alignment, align_sides, kind_of_candidates, side_of
 from factorbus.client.arguments import checked_flag, of_type
+from factorbus.client.call_order import call_order
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.map import Map
@@ -103,18 +104,20 @@ def attach(
     checked_flag("settle", settle)
     if absolute not in _ABSOLUTE:
         raise CannotMerge(f"absolute is {absolute!r}; wanted one of {', '.join(_ABSOLUTE)}")
-    given = batch_of("candidates", candidates)
+    given, order = batch_of("candidates", candidates), call_order(candidates)
     for _ in range(_TRIES - 1):
         try:
-            return _attach(here, letters, given, absolute, settle, timeout_s)
+            return _attach(here, letters, given, order, absolute, settle, timeout_s)
         except Refused as problem:
             # What the map had when it was asked is gone: the part is attached by another, or poses are taken out.
             if problem.code not in ("unknown_factor", "unknown_variable"):
                 raise
-    return _attach(here, letters, given, absolute, settle, timeout_s)
+    return _attach(here, letters, given, order, absolute, settle, timeout_s)
 
 
-def _attach(here: Map, letters: str, given: Batch, absolute: str, settle: bool, timeout_s: float | None) -> Attached:
+def _attach(
+    here: Map, letters: str, given: Batch, order: Sequence[int], absolute: str, settle: bool, timeout_s: float | None
+) -> Attached:
     kind = kind_of_candidates(given)
     # 1. The part, and that nothing joins it to the rest.
     graph = here.graph(timeout_s).batch
@@ -128,7 +131,7 @@ def _attach(here: Map, letters: str, given: Batch, absolute: str, settle: bool, 
     # 3. Where it lies.
     sides = [[_places(g, roles) for g in groups] for groups in (rest, part.variables)]
     _check_candidates(given, kind, *sides)
-    found = align_sides(side_of(here, sides[0], kind), side_of(here, sides[1], kind), given, timeout_s)
+    found = align_sides(side_of(here, sides[0], kind), side_of(here, sides[1], kind), given, order, timeout_s)
     if found.verdict != ALIGNED or found.frame is None:
         return Attached(found)
     anchors = found.anchors()

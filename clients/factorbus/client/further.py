@@ -23,8 +23,8 @@ from factorbus.proto.problems import BadLoss, BadOption, BadShape
 from factorbus.proto.symbols import format_symbol
 
 _KEYWORDS = {"arm": "lever"}  # what a modifier is called here, where its name is another
-# In the order that names of kinds have them in.
 _LETTERLESS = 1 << 56  # keys with a letter are not below
+# In the order that names of kinds have them in.
 MODIFIERS = ("mount", "bias", "scale", "frame", "arm", "offset", *LENSES)
 
 
