@@ -12,13 +12,14 @@ import pytest
 
 from factorbus.solver.kernels.jit import compile as _jit
 from factorbus.solver.kernels.jit import disk as _disk
+from factorbus.solver.kernels.jit import frame_room as _room
 from factorbus.solver.kernels.jit import held as _held
 from factorbus.solver.kernels.jit import lowering as _lowering
 from factorbus.solver.kernels.jit import releases as _releases
 from factorbus.solver.kernels.jit import shared as _shared
 from factorbus.solver.kernels.jit import stamps as _stamps
 
-MAKERS = [Path(one.__file__) for one in (_disk, _held, _jit, _lowering, _releases, _shared, _stamps)]
+MAKERS = [Path(one.__file__) for one in (_disk, _held, _jit, _lowering, _releases, _room, _shared, _stamps)]
 CALLER = """
 from kernels.jit import compile as _jit
 from kernels.callee import twice

@@ -59,6 +59,7 @@ from factorbus.ownership import make_private
 # From beside this file: a copy of them elsewhere is one by itself.
 from . import releases
 from .disk import cache_in
+from .frame_room import call_with_room
 from .shared import SharedKernel, only_compile
 from .stamps import stamp_of
 
@@ -297,7 +298,7 @@ def _compile_declared(dispatcher: Any) -> None:
     with global_compiler_lock:
         if dispatcher._can_compile:
             for signature in dispatcher.factorbus_signatures:
-                dispatcher.compile(signature)
+                call_with_room(dispatcher.compile, signature)
             dispatcher.disable_compile()
             del dispatcher._compile_for_args
 

@@ -5,7 +5,7 @@ read and written in a few instructions.  A part stays as it was written until a 
 is its own.
 
 All of this is Numba's private side, so it is done with releases that were tested (`releases`), and three functions of
-Numba's are exchanged only while a function of ours is compiled (`changed_numba`), four in a process that compiles for
+Numba's are exchanged only while a function of ours is compiled (`changed_numba`), six in a process that compiles for
 others alone.  What each change is worth is in docs/decisions/private-numba.md.
 """
 
@@ -16,7 +16,8 @@ from typing import Any
 
 import llvmlite.binding
 from llvmlite import ir
-from numba.core import cgutils, types
+from llvmlite.binding import create_new_function_pass_manager, create_pass_builder, create_pipeline_tuning_options
+from numba.core import cgutils, config, event, types
 from numba.core import ir as numba_ir
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
@@ -30,6 +31,7 @@ from numba.np.arrayobj import load_item, store_item
 from .held import FoldingBuilder, drop_unused, find_held
 from .shared import compiles_for_others
 
+_LEVEL = int(getattr(config, "OPT"))  # noqa: B009  (Numba sets it when it is imported)
 _from_the_end = arrayobj.fix_integer_index
 
 
@@ -179,6 +181,10 @@ def _lower_for_kernels(self: Any, state: Any) -> bool:
     return _lower(self, state)
 
 
+def _tell_nobody(kind: str, data: Any = None, exc_details: Any = None) -> None:
+    """That a lock is taken, that LLVM is called: nobody listens in a process that compiles for others."""
+
+
 _find_call_type = types.BaseFunction.get_call_type
 _call_types: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by the identity of the function, which is kept with them
 
@@ -201,7 +207,12 @@ _EXCHANGED = (
     (types.BaseFunction, "get_call_type", _known_call_type),
 )
 # In a process where Numba keeps nothing for others: all that it compiles is for kernels.
-_EXCHANGED_APART = (*_EXCHANGED, (BaseNativeLowering, "run_pass", _lower_for_kernels))
+_EXCHANGED_APART = (
+    *_EXCHANGED,
+    (BaseNativeLowering, "run_pass", _lower_for_kernels),
+    (event, "start_event", _tell_nobody),
+    (event, "end_event", _tell_nobody),
+)
 
 
 @contextmanager
@@ -239,7 +250,10 @@ class _PartLibrary(JITCodeLibrary):
     def _optimize_functions(self, ll_module: Any) -> None:
         """Only what makes it smaller: the rest is done where it is linked."""
         ll_module.data_layout = self._codegen._data_layout
-        passes, builder = self._codegen._function_pass_manager(opt=1)
+        passes, builder = create_new_function_pass_manager(), self._codegen._pass_builder()
+        passes.add_sroa_pass()
+        passes.add_simplify_cfg_pass()
+        passes.add_instruction_combine_pass()
         for function in ll_module.functions:
             if not function.is_declaration:
                 passes.run(function, builder)
@@ -255,16 +269,25 @@ class _KernelLibrary(JITCodeLibrary):
         library._ensure_finalized()
         _add_linked(self._linking_libraries, library)
 
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """That is done once they are all in one module."""
+        ll_module.data_layout = self._codegen._data_layout
+
     def _optimize_final_module(self) -> None:
         """What the kernel calls is made its own first: nothing of another kernel is taken for it, whatever came before,
         and LLVM passes no argument that nobody reads.  An array is nine words of them, of which two or three are read.
 
         Numba runs cheap passes before, to see the counting of references in one function; here hardly any is left.
+        And it has loops unrolled and interleaved: half as much code again, which no kernel is faster with.
         """
         for function in self._final_module.functions:
             if function.linkage == llvmlite.binding.Linkage.linkonce_odr and not function.is_declaration:
                 function.linkage = llvmlite.binding.Linkage.internal
-        passes, builder = self._codegen._module_pass_manager()
+        tuning = create_pipeline_tuning_options(_LEVEL)
+        tuning.loop_unrolling = tuning.loop_interleaving = False
+        builder = create_pass_builder(self._codegen._tm, tuning)
+        passes = builder.getModulePassManager()
+        passes.add_refprune_pass()
         passes.run(self._final_module, builder)
 
     def _get_module_for_linking(self) -> Any:
