@@ -168,6 +168,8 @@ def rho(loss: str, k: float, s: float) -> float:
         return k**2 / 3 * (1 - max(1 - s / k**2, 0) ** 3)
     if loss == "dcs":
         return s if s <= k**2 else k**2 * (3 * s - k**2) / (s + k**2)
+    if loss:
+        raise KeyError(f"no twin of the loss {loss!r}")
     return s
 
 

@@ -8,24 +8,42 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.dispatch import check_same
 
 ROUNDS = 5
 
 
+def _huber(s: F64, scale: F64) -> F64:
+    return scale / np.sqrt(np.maximum(s, scale * scale))
+
+
+def _cauchy(s: F64, scale: F64) -> F64:
+    return scale * scale / (scale * scale + s)
+
+
+def _geman_mcclure(s: F64, scale: F64) -> F64:
+    return _cauchy(s, scale) ** 2
+
+
+def _tukey(s: F64, scale: F64) -> F64:
+    return np.maximum(1.0 - s / (scale * scale), 0.0) ** 2
+
+
+def _dcs(s: F64, scale: F64) -> F64:
+    return np.where(s > scale * scale, (2.0 * _cauchy(s, scale)) ** 2, 1.0)
+
+
+# ρ'(s) of a factor with s = rᵀ Ω r, by its loss.  (3.9) to (3.13)
+WEIGHTS = {"huber": _huber, "cauchy": _cauchy, "geman-mcclure": _geman_mcclure, "tukey": _tukey, "dcs": _dcs}
+check_same("weight by loss", at.LOSS_CODES, WEIGHTS, __name__)
+
+
 def weights_of(loss: I64, s: F64, scale: F64) -> F64:
-    """ρ'(s) of each factor with s = rᵀ Ω r.  (3.9) to (3.13)"""
-    c = scale * scale
-    share = c / (c + s)
-    over = s > c
+    """ρ'(s) of each factor with s = rᵀ Ω r, by the code of its loss."""
     weights = np.ones(s.size)
-    for code, values in (
-        (at.LOSS_CODES["huber"], np.where(over, scale / np.sqrt(np.maximum(s, c)), 1.0)),
-        (at.LOSS_CODES["cauchy"], share),
-        (at.LOSS_CODES["geman-mcclure"], share**2),
-        (at.LOSS_CODES["tukey"], np.where(over, 0.0, 1.0 - np.minimum(s / c, 1.0)) ** 2),
-        (at.LOSS_CODES["dcs"], np.where(over, (2.0 * share) ** 2, 1.0)),
-    ):
-        weights = np.where(loss == code, values, weights)
+    for name, code in at.LOSS_CODES.items():
+        has = loss == code
+        weights[has] = WEIGHTS[name](s[has], scale[has])
     return np.maximum(weights, 1e-6)
 
 
