@@ -59,6 +59,13 @@ def test_no_file_has_more_than_400_lines() -> None:
     assert sorted(found) == []
 
 
+def test_the_solver_is_a_front_of_few_lines() -> None:
+    """What a step does is behind `Stepper`, what changes a map in `changing`."""
+    tree = ast.parse((ROOT / "service/factorbus/solver/solver.py").read_text(encoding="utf-8"))
+    (solver,) = (node for node in tree.body if isinstance(node, ast.ClassDef))
+    assert (solver.end_lineno or 0) - solver.lineno + 1 < 150
+
+
 def test_no_column_of_a_table_is_called_by_a_number() -> None:
     """An array of integers in a kernel is a table: 0 and 1 may be a pair's ends, from 2 on a column has a name."""
     records = set(record_tables())

@@ -12,6 +12,7 @@ from factorbus.proto.camera import Camera
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.changes.convert_to_points import find_convertible
 from factorbus.solver.changing import with_changes, with_converted
 
 LEVEL = np.array([0.0, 0, 0, 0, 0, 0, 1])
@@ -54,11 +55,11 @@ def test_features_become_points_and_the_estimate_stays(mode: str) -> None:
     drive_past(solver)
     before = solver.step(settle=True)
     features = next(group for group in solver.estimate() if group.kind == "idp")
-    found = solver.convertible(0.1)
+    found = find_convertible(solver.factor_graph, 0.1)
     assert found.size > 0
     assert set(found.tolist()) <= set(features.keys.tolist())
-    assert solver.convertible(1e9).size == 12
-    assert solver.convertible(0.0).size == 0
+    assert find_convertible(solver.factor_graph, 1e9).size == 12
+    assert find_convertible(solver.factor_graph, 0.0).size == 0
     made, report = with_converted(solver, features.keys)
     settled = made.step(settle=True)
     assert (made.variable_count, made.factor_count) == (solver.variable_count, solver.factor_count)
@@ -95,12 +96,12 @@ def test_a_feature_with_a_linear_factor_stays_one() -> None:
     solver = Solver(Options())
     drive_past(solver)
     before = solver.step(settle=True)
-    assert solver.convertible(1e9).size == 12
+    assert find_convertible(solver.factor_graph, 1e9).size == 12
     after, _, report, _ = with_changes(solver, [Change("marginalize", keys=np.array([symbol("x", 0)]))], settle=True)
     linear = [g for g in after.graph()[1] if g.kind.startswith("linear_") and g.kind.endswith("_idp")]
     assert sum(len(g.keys) for g in linear) == 12
     assert report.chi2 == pytest.approx(before.chi2, rel=1e-9)
-    assert after.convertible(1e9).size == 0
+    assert find_convertible(after.factor_graph, 1e9).size == 0
     with pytest.raises(errors.KindMismatch, match="linear factor"):
         with_converted(after, np.array([symbol("f", 3)]))
 
@@ -121,5 +122,5 @@ def test_the_linearity_index_is_the_papers() -> None:
         p, sigma = dense_idp.point(y), np.sqrt(covariance[start + 5, start + 5])
         cosine = (p - last) @ dense_idp.direction(y) / np.linalg.norm(p - last)
         index = 4 * sigma / y[5] ** 2 * abs(cosine) / np.linalg.norm(p - last)
-        assert key in solver.convertible(index * 1.001).tolist()
-        assert key not in solver.convertible(index * 0.999).tolist()
+        assert key in find_convertible(solver.factor_graph, index * 1.001).tolist()
+        assert key not in find_convertible(solver.factor_graph, index * 0.999).tolist()

@@ -214,4 +214,4 @@ def test_copies_have_them(mode: str) -> None:
 
 def test_memory_counts_them() -> None:
     bare = fed(batch._replace(variables=tuple(g._replace(stamps=None) for g in batch.variables)) for batch in line())
-    assert fed(line()).columns_bytes()[0] - bare.columns_bytes()[0] == 8 * 6
+    assert fed(line()).factor_graph.columns_bytes()[0] - bare.factor_graph.columns_bytes()[0] == 8 * 6

@@ -9,6 +9,7 @@ from factorbus.solver.changes.in_place import try_in_place
 from factorbus.solver.changes.requested import ChangeLike, collect
 from factorbus.solver.errors import Underconstrained
 from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import Addition, BatchLike
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.report import StepReport
@@ -34,7 +35,7 @@ def with_changes(
     than the bounds of numbers let it.  Nothing may be staged.  Raises as `changes.collect`, `stage` and `step` do.
     """
     edits = collect(solver._graph, changes)
-    made = solver._taken_over(edited(solver._graph, edits))
+    made = _taken_over(solver, edited(solver._graph, edits))
     if edits.added:
         admit(made._graph, Addition((), edits.added))
     before = made.variable_count, made.factor_count
@@ -75,5 +76,12 @@ def with_converted(solver: Solver, keys: I64) -> tuple[Solver, StepReport]:
     Later observations of them may still be sent as `idp_seen`.  Raises UnknownVariable, KindMismatch, and what `step`
     does.
     """
-    made = solver._taken_over(with_points(solver._graph, pick_features(solver._graph, keys)))
+    made = _taken_over(solver, with_points(solver._graph, pick_features(solver._graph, keys)))
     return made, made._stepper.resume(False)
+
+
+def _taken_over(solver: Solver, graph: FactorGraph) -> Solver:
+    """A solver with the options of this one that has this graph, and has not solved it."""
+    made = Solver(solver._options)
+    made._graph.take(graph)
+    return made

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.changes.convert_to_points import find_convertible
 from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.source import CovarianceSource
@@ -133,10 +132,6 @@ class Solver:
         """Whether the last step left nothing for later ones, as one with a budget may."""
         return self._stepper.complete
 
-    def convertible(self, below: float) -> I64:
-        """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
-        return self._graph.keys[find_convertible(self._graph, below)]
-
     def renew(self, other: "Solver", variables: int, factors: int) -> StepReport:
         """Take over the first variables and factors of `other`, as they are; the first step of a new solver."""
         edits = unchanged(other._graph)
@@ -152,10 +147,6 @@ class Solver:
     def memory_bytes(self) -> int:
         """Bytes in use for the graph and for what solves it."""
         return self._graph.memory_bytes() + self._stepper.memory_bytes()
-
-    def columns_bytes(self) -> tuple[int, int]:
-        """Bytes of all variables, and of all factors, as columns."""
-        return self._graph.columns_bytes()
 
     def graph(self, variables: int | None = None, factors: int | None = None) -> tuple[list[Group], list[FactorGroup]]:
         """A copy of everything: variables with their present values, and factors by kind in the order of their ids.
@@ -190,9 +181,3 @@ class Solver:
             return None
         load(self._graph, parts["_graph"], VALUE_TYPES)
         return self._stepper.resume(False)
-
-    def _taken_over(self, graph: FactorGraph) -> "Solver":
-        """A solver with the same options that has this graph, and has not solved it."""
-        made = Solver(self._options)
-        made._graph.take(graph)
-        return made

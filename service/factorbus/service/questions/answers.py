@@ -197,7 +197,7 @@ def _check(solver: Any, question: Question, has_copy: bool, room: Room) -> None:
     """Is there room for what `question` needs copied, and for its answer?  Raises TooLarge, OutOfMemory."""
     name = question.name
     if name in ("estimate", "graph", "export", "interest", "components") or question.batch:
-        variables, factors = solver.columns_bytes()
+        variables, factors = solver.factor_graph.columns_bytes()
         size = variables if name in ("estimate", "interest") else variables + factors
         if name == "graph" or (name == "estimate" and question.keys is None and question.part is None):
             room.fits("the answer", size)

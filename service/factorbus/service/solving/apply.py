@@ -38,6 +38,7 @@ from factorbus.service.core.events import (
     refusal,
 )
 from factorbus.service.solving.holding import Broken, Holding
+from factorbus.solver.changes.convert_to_points import find_convertible
 from factorbus.solver.changing import try_change, with_converted
 from factorbus.solver.divergence import check_step, copied, find_diverged, is_elsewhere, is_usual, with_changes_within
 from factorbus.solver.errors import SolverError
@@ -372,7 +373,7 @@ class MapSolver(Holding):
         Where that step fails they stay what they are.
         """
         started = time.perf_counter()
-        keys = self._solver.convertible(below)
+        keys = find_convertible(self._solver.factor_graph, below)
         if not keys.size:
             return
         try:

@@ -27,7 +27,7 @@ _GUESS, _SURER = 14 + 20, 10.0
 
 
 def find_convertible(graph: FactorGraph, below: float) -> I64:
-    """The variables, ascending, that are features whose linearity index (3.19) is below this.
+    """Keys of the features whose linearity index (3.19) is below this: as points they are as good Gaussians.
 
     One whose first guess of the depth still says something is left: as a point it would lose that, and a map its scale.
     """
@@ -41,7 +41,7 @@ def find_convertible(graph: FactorGraph, below: float) -> I64:
     known = found[features] * np.abs(graph.values[graph.var[features, at.V_AT] + 5]) / 4.0
     found[features[guessed < _SURER * known]] = np.inf
     found[has_linear_factor(graph)] = np.inf
-    return np.flatnonzero(found < below)
+    return graph.keys[np.flatnonzero(found < below)]
 
 
 def pick_features(graph: FactorGraph, keys: I64) -> I64:
