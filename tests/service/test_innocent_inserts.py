@@ -17,8 +17,9 @@ from factorbus.service.solving import apply
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
 SIGMAS = (0.05, 0.05, 0.03)
-# Maps in which values run off when an ordinary insert comes that has nothing to do with them.
-RUN_OFF = (0, 4, 8)
+# Of these maps, values run off in some when an ordinary insert comes that has nothing to do with them: in which, the
+# last bits decide.
+SOME_RUN_OFF, ENOUGH = range(40), 3
 # Maps in which a step that settles takes back the tree's own, whose χ² is NaN, and finds nothing better.
 TAKEN_BACK = (137, 160)
 
@@ -80,16 +81,21 @@ def test_an_ordinary_insert_is_accepted_whatever_was_before_it(mode: str) -> Non
             drive(mode, seed, 25)
 
 
-@pytest.mark.parametrize("seed", RUN_OFF)
-def test_it_is_where_others_run_off_and_comes_to_the_same_bits_again(seed: int) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        tried, again = drive("bayes-tree", seed, 40), Map("bayes-tree")
-        assert tried.held > 0, "another seed: nothing runs off here any more"
-        for one in tried.came:
-            list(again.map_solver.apply_again([one]))
-    assert again.estimate() == tried.estimate()
-    assert again.map_solver.revision == tried.map_solver.revision
+def test_it_is_where_others_run_off_and_comes_to_the_same_bits_again() -> None:
+    ran_off = 0
+    for seed in SOME_RUN_OFF:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            tried, again = drive("bayes-tree", seed, 40), Map("bayes-tree")
+            if not tried.held:
+                continue
+            for one in tried.came:
+                list(again.map_solver.apply_again([one]))
+        assert again.estimate() == tried.estimate()
+        assert again.map_solver.revision == tried.map_solver.revision
+        if (ran_off := ran_off + 1) == ENOUGH:
+            return
+    pytest.fail(f"values ran off in {ran_off} of {len(SOME_RUN_OFF)} maps; wanted {ENOUGH}: draw other extremes")
 
 
 @pytest.mark.parametrize("seed", TAKEN_BACK)
