@@ -6,7 +6,6 @@ from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel,
 from factorbus.solver.covariance.kernels.squares import row_length
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
-from factorbus.solver.kernels.jit.simd import at as load
 
 # A change of a block by less than this share of a variance is not followed down the tree.  Over 3,500 updates that
 # adds nothing to the 2·10⁻⁹ that rounding leaves.
@@ -42,6 +41,6 @@ def mark_changed(tree: Tree, c: int, dims: I64, a: F64, target: int, changes: Bl
         scalar += d
         for i in range(d):
             for j in range(i, d):
-                change, scale = load(a, corner + i * ld + j) - block[i, j], load(a, corner + i * (ld + 1))
-                if change * change > NEGLIGIBLE * NEGLIGIBLE * scale * load(a, corner + j * (ld + 1)):
+                change, scale = a[corner + i * ld + j] - block[i, j], a[corner + i * (ld + 1)]
+                if change * change > NEGLIGIBLE * NEGLIGIBLE * scale * a[corner + j * (ld + 1)]:
                     changes.at[v] = changes.step

@@ -18,8 +18,7 @@ from factorbus.solver.covariance.kernels.substitute import (
 )
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
-from factorbus.solver.kernels.jit.simd import LANES, put, zero
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import LANES, zero
 
 
 @kernel("void(int64[::1], int64[::1], int64[::1], int64[::1], int64[::1], int64[::1], int64[::1], float64[:,:,:])")
@@ -88,7 +87,7 @@ def forward_path(hub: int, tree: Tree, layout: ColumnLayout, a: F64, x: RightSid
             zero(a, x.at + start[lists[s]] * x.ld, dims[lists[s]] * x.ld)
         c = clique[c, tl.C_PARENT]
     for k in range(dims[hub]):
-        put(a, x.at + (start[hub] + k) * x.ld + k, 1.0)
+        a[x.at + (start[hub] + k) * x.ld + k] = 1.0
     c = tree.node[hub, tl.N_CLIQUE]
     while c >= 0:
         forward(tree, c, layout, a, x)
@@ -104,4 +103,4 @@ def put_cross_block(hub: int, partner: int, layout: ColumnLayout, a: F64, ldx: i
     first = layout.start[partner]
     for i in range(layout.dims[hub]):
         for j in range(layout.dims[partner]):
-            out[i, j] = load(a, (first + j) * ldx + i)
+            out[i, j] = a[(first + j) * ldx + i]

@@ -26,8 +26,7 @@ from factorbus.solver.covariance.kernels.substitute import (
 )
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
-from factorbus.solver.kernels.jit.simd import LANES, put, zero
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import LANES, zero
 
 NEAR_SINGULAR, DONE = 0, 1
 # The smallest eigenvalue that G may have: the share that other factors have in what a factor measures.  Of what is
@@ -156,7 +155,7 @@ def add_rows(ends: I64, H: F64, layout: ColumnLayout, a: F64, ld: int) -> None:
         for i in range(dims[v]):
             place = (start[v] + i) * ld
             for j in range(H.shape[2]):
-                put(a, place + j, load(a, place + j) + H[e, i, j])
+                a[place + j] += H[e, i, j]
 
 
 @part
@@ -169,7 +168,7 @@ def scale(path: I64, tree: Tree, layout: ColumnLayout, a: F64, ld: int, ranks: i
             for line in range(start[lists[s]] * ld, (start[lists[s]] + dims[lists[s]]) * ld, ld):
                 for i in range(ranks):
                     for j in range(i + 1):
-                        C[i, j] -= load(a, line + i) * load(a, line + j)
+                        C[i, j] -= a[line + i] * a[line + j]
     for i in range(ranks):
         C[i, i] += 1.0
         for j in range(i + 1):
@@ -185,10 +184,10 @@ def scale(path: I64, tree: Tree, layout: ColumnLayout, a: F64, ld: int, ranks: i
         for s in range(clique[c, tl.C_LIST], clique[c, tl.C_LIST] + clique[c, tl.C_FRONTALS]):
             for line in range(start[lists[s]] * ld, (start[lists[s]] + dims[lists[s]]) * ld, ld):
                 for i in range(ranks):
-                    total = load(a, line + i)
+                    total = a[line + i]
                     for j in range(i):
-                        total -= load(a, line + j) * C[i, j]
-                    put(a, line + i, total / C[i, i])
+                        total -= a[line + j] * C[i, j]
+                    a[line + i] = total / C[i, i]
     return DONE
 
 
@@ -214,7 +213,7 @@ def subtract_square(a: F64, first: int, ld: int, d: int, block: F64) -> bool:
         for j in range(i + 1):
             total = 0.0
             for q in range(ld):
-                total += load(a, first + i * ld + q) * load(a, first + j * ld + q)
+                total += a[first + i * ld + q] * a[first + j * ld + q]
             if i == j and total > NEGLIGIBLE * block[i, i]:
                 more = True
             block[i, j] -= total

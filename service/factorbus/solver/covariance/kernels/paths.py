@@ -14,8 +14,7 @@ from factorbus.solver.covariance.kernels.substitute import GROUP, ColumnLayout, 
 from factorbus.solver.covariance.kernels.tiles import negative_product
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
-from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, put
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS
 from factorbus.solver.kernels.model import layout as at
 
 
@@ -45,7 +44,7 @@ def joint_block(variables: I64, var: I64, sizes: I64, tree_table: I64, out: F64)
     column = 0
     for v in variables:
         for i in range(dims[v]):
-            put(a, (start[v] + i) * ld + column, 1.0)
+            a[(start[v] + i) * ld + column] = 1.0
             column += 1
     for c in order:
         for g in range(0, ld, GROUP * LANES):
@@ -53,7 +52,7 @@ def joint_block(variables: I64, var: I64, sizes: I64, tree_table: I64, out: F64)
     square(rows, d, a, ld)
     for i in range(d):
         for j in range(i, d):
-            out[i, j] = out[j, i] = -load(a, (rows + i) * ld + j)
+            out[i, j] = out[j, i] = -a[(rows + i) * ld + j]
 
 
 @inline_kernel

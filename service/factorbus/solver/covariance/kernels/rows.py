@@ -2,8 +2,6 @@
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, kernel
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 
 
 @kernel("int64(int64[::1], int64[:,::1])")
@@ -25,6 +23,6 @@ def copy_rows(order: I64, clique: I64, numbers: F64, out: F64) -> None:
         for i in range(p):
             start = row[tl.C_ROWS] + i * ld
             for k in range(i, width):
-                put(out, first + i * width + k, load(numbers, start + k))
+                out[first + i * width + k] = numbers[start + k]
         row[tl.C_ROWS], row[tl.C_LD] = first, width
         first += p * width

@@ -19,8 +19,7 @@ from factorbus.solver.covariance.kernels.tiles import (
 )
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
-from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, put, zero
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, zero
 
 _DIMS = 6  # of the largest variable
 _TOGETHER = 3  # rows that are copied together: a variable of the plane has as many
@@ -139,9 +138,9 @@ def solve_for_square(row: I64, numbers: F64, a: F64, w: int, wide: int) -> None:
     for i in range(p):
         source, v = start + i * step + p, w + i * wide
         for j in range(m):
-            put(a, v + j, load(numbers, source + j))
+            a[v + j] = numbers[source + j]
         zero(a, v + m, wide - m)
-        put(a, v + m + p - 1 - i, 1.0)
+        a[v + m + p - 1 - i] = 1.0
     end, high = p, height(p)
     while end > 0:
         top = max(0, end - high)
@@ -166,5 +165,5 @@ def put_blocks(tree: Tree, c: int, dims: I64, a: F64, target: int, out: F64) -> 
         block, d = out[lists[s]], dims[lists[s]]
         for i in range(d):
             for j in range(i, d):
-                block[i, j] = block[j, i] = load(a, corner + i * ld + j)
+                block[i, j] = block[j, i] = a[corner + i * ld + j]
         corner += d * (ld + 1)

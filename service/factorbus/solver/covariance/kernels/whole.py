@@ -32,8 +32,7 @@ from factorbus.solver.covariance.kernels.substitute import (
 from factorbus.solver.covariance.kernels.tiles import negative_product
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
-from factorbus.solver.kernels.jit.simd import LANES, put
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import LANES
 
 AHEAD = 3  # cliques: it takes that long for rows to come into the cache
 
@@ -115,7 +114,7 @@ def put_column(
         gather_rows(frontals, layout, a, x, result)
         for i in range(p):
             for q in range(ldx):
-                put(a, x.scratch + (m + p - 1 - i) * ldx + q, -load(a, result + i * ldx + q))
+                a[x.scratch + (m + p - 1 - i) * ldx + q] = -a[result + i * ldx + q]
     for i in range(0, p, high):
         C = Tile(min(high, p - i), x.vectors, result + i * ldx, ldx)
         negative_product(a, C, a, Strided(w + i * wide, wide, 1), VectorRows(x.scratch, ldx), depth)
@@ -124,5 +123,5 @@ def put_column(
         block, d = out[frontals[s]], layout.dims[frontals[s]]
         for j in range(d):
             for i in range(len(block)):
-                block[i, j] = load(a, result + j * ldx + i)
+                block[i, j] = a[result + j * ldx + i]
         result += d * ldx

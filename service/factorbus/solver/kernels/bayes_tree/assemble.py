@@ -11,8 +11,7 @@ from factorbus.solver.kernels.bayes_tree.allocator import give_numbers, size_cla
 from factorbus.solver.kernels.bayes_tree.fronts import update_layout
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import TILE_ROWS, Block, Panel, add_run, put, zero
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import TILE_ROWS, Block, Panel, add_run, zero
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import head_of, is_member
 from factorbus.solver.kernels.model.records import Graph
@@ -59,7 +58,7 @@ def damp_pivots(graph: Graph, tree: Tree, row: I64) -> None:
         v = tree.lists[s]
         d = graph.var[v, at.V_SCALAR]
         for a in range(dim_of_variable(graph.var, v)):
-            put(tree.numbers, k, DAMPING * tree.scalars[1, d + a])
+            tree.numbers[k] = DAMPING * tree.scalars[1, d + a]
             k += row[tl.C_LD] + 1
 
 
@@ -135,7 +134,7 @@ def _add_blocks(di: int, dj: int, ci: int, cj: int, h: int, row: I64, hessian: F
     if ci >= 0 and cj >= 0:
         _add_across(di, dj, ci, cj, h + di * di, row, hessian, numbers)
     corner = row_of(last, row) + last
-    put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
+    numbers[corner] += hessian[g + di + dj]
 
 
 @part
@@ -172,12 +171,12 @@ def _add_across(di: int, dj: int, ci: int, cj: int, h: int, row: I64, hessian: F
         for a in range(di):
             target = row_of(ci + a, row) + cj
             for b in range(dj):
-                put(numbers, target + b, load(numbers, target + b) + load(hessian, h + a * dj + b))
+                numbers[target + b] += hessian[h + a * dj + b]
     else:
         for b in range(dj):
             target = row_of(cj + b, row) + ci
             for a in range(di):
-                put(numbers, target + a, load(numbers, target + a) + load(hessian, h + a * dj + b))
+                numbers[target + a] += hessian[h + a * dj + b]
 
 
 @inline_kernel
@@ -185,8 +184,8 @@ def _add_diagonal(d: int, c: int, last: int, h: int, g: int, row: I64, hessian: 
     for a in range(d):
         target = row_of(c + a, row)
         for b in range(a, d):
-            put(numbers, target + c + b, load(numbers, target + c + b) + load(hessian, h + a * d + b))
-        put(numbers, target + last, load(numbers, target + last) + load(hessian, g + a))
+            numbers[target + c + b] += hessian[h + a * d + b]
+        numbers[target + last] += hessian[g + a]
 
 
 @part
@@ -230,7 +229,7 @@ def extend_add(a: F64, child: int, width: int, runs: I64, count: int, row: I64) 
                 else:
                     for j in range(runs[t, fr.RUN_COUNT]):
                         turned = row_of(other + j, row) + into + i
-                        put(a, turned, load(a, turned) + load(a, source + runs[t, fr.RUN_FIRST] + j))
+                        a[turned] += a[source + runs[t, fr.RUN_FIRST] + j]
 
 
 @inline_kernel
@@ -240,7 +239,7 @@ def add_few(a: F64, i: int, j: int, count: int) -> None:
         add_run(a, i, j, count)
     else:
         for k in range(count):
-            put(a, i + k, load(a, i + k) + load(a, j + k))
+            a[i + k] += a[j + k]
 
 
 @part
@@ -333,7 +332,7 @@ def _add_far_end(graph: Graph, tree: Tree, f: int, v: int, m: int, u: int, wide:
     dj = dim_of_variable(var, j) if j >= 0 else 0
     g = h + di * di + di * dj + dj * dj
     corner = u + fr.update_row(m, wide) + m
-    put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
+    numbers[corner] += hessian[g + di + dj]
     other = j if i == v else i
     if other < 0 or var[other, at.V_COLUMN] < 0 or node[other, tl.N_COLUMN] < 0:
         return
@@ -344,8 +343,8 @@ def _add_far_end(graph: Graph, tree: Tree, f: int, v: int, m: int, u: int, wide:
     for a in range(d):
         target = u + fr.update_row(c + a, wide)
         for b in range(a, d):
-            put(numbers, target + c + b, load(numbers, target + c + b) + load(hessian, h + a * d + b))
-        put(numbers, target + m, load(numbers, target + m) + load(hessian, g + a))
+            numbers[target + c + b] += hessian[h + a * d + b]
+        numbers[target + m] += hessian[g + a]
 
 
 @inline_kernel
@@ -364,8 +363,8 @@ def _add_child(graph: Graph, tree: Tree, child: int, m: int, u: int, wide: int) 
             for a in range(dim):
                 line, target = source + fr.update_row(x + a, width), u + fr.update_row(into + a, wide)
                 for b in range(a, dim):
-                    put(numbers, target + into + b, load(numbers, target + into + b) + load(numbers, line + x + b))
-                put(numbers, target + m, load(numbers, target + m) + load(numbers, line + last))
+                    numbers[target + into + b] += numbers[line + x + b]
+                numbers[target + m] += numbers[line + last]
             y = x + dim
             for t in range(s + 1, end):
                 w = lists[t]
@@ -377,8 +376,8 @@ def _add_child(graph: Graph, tree: Tree, child: int, m: int, u: int, wide: int) 
                             target = u + fr.update_row(into + a, wide) + across + b
                             if across < into:
                                 target = u + fr.update_row(across + b, wide) + into + a
-                            put(numbers, target, load(numbers, target) + load(numbers, line + b))
+                            numbers[target] += numbers[line + b]
                 y += dims
         x += dim
     corner = u + fr.update_row(m, wide) + m
-    put(numbers, corner, load(numbers, corner) + load(numbers, source + fr.update_row(last, width) + last))
+    numbers[corner] += numbers[source + fr.update_row(last, width) + last]

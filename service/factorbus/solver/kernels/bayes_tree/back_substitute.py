@@ -16,8 +16,6 @@ from factorbus.solver.kernels.bayes_tree.work import SOLVING, note_work, work_of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.prefetch import prefetch
 from factorbus.solver.kernels.jit.scratch import take, take_floats
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
@@ -125,7 +123,7 @@ def note_behind(ids: I64, clique: I64, state: I64) -> None:
             roots += 1
             behind |= clique[ids[f], tl.C_MOVES] & tl.BEHIND != 0
     if behind or roots == state[tl.S_ROOTS]:
-        state[tl.S_BEHIND] = state[tl.S_BEHIND] + 1 if behind else 0
+        state[tl.S_BEHIND] += 1 if behind else 0
 
 
 @inline_kernel
@@ -209,10 +207,10 @@ def has_moved(graph: Graph, tree: Tree, c: int, far: float, delta: F64, weight: 
         if moves:
             rg.displace(v, var, tree.lin[0], turns, motions, c * tl.M_WIDTH, motion)
         for a in range(dim_of_variable(var, v)):
-            gap = load(delta, d + a) - load(numbers, used)
+            gap = delta[d + a] - numbers[used]
             if moves:
                 gap -= motion[rg.LOCAL + a]
-            square = gap * gap * load(weight, d + a)
+            square = gap * gap * weight[d + a]
             if square > far:
                 return True
             left = max(left, square)
@@ -236,7 +234,7 @@ def gather_separator(row: I64, var: I64, lists: I64, delta: F64, numbers: F64) -
         v = lists[s]
         d = var[v, at.V_SCALAR]
         for a in range(dim_of_variable(var, v)):
-            put(numbers, x, load(delta, d + a))
+            numbers[x] = delta[d + a]
             x += 1
 
 
@@ -251,46 +249,46 @@ def solve_rows(row: I64, numbers: F64, shares: F64) -> None:
     p, used, ld = row[tl.C_PIVOTS], row[tl.C_USED], row[tl.C_LD]
     width = p + row[tl.C_SEPARATOR_SCALARS]
     for i in range(p):
-        put(shares, i, 1.0 / load(numbers, row[tl.C_ROWS] + i * (ld + 1)))
+        shares[i] = 1.0 / numbers[row[tl.C_ROWS] + i * (ld + 1)]
     i = 0
     while i + 3 <= p:
         line, x, y, z = row[tl.C_ROWS] + i * ld, 0.0, 0.0, 0.0
         for k in range(p, width):
-            known = load(numbers, used + k)
-            x += load(numbers, line + k) * known
-            y += load(numbers, line + ld + k) * known
-            z += load(numbers, line + 2 * ld + k) * known
-        put(numbers, used + i, load(numbers, line + width) - x)
-        put(numbers, used + i + 1, load(numbers, line + ld + width) - y)
-        put(numbers, used + i + 2, load(numbers, line + 2 * ld + width) - z)
+            known = numbers[used + k]
+            x += numbers[line + k] * known
+            y += numbers[line + ld + k] * known
+            z += numbers[line + 2 * ld + k] * known
+        numbers[used + i] = numbers[line + width] - x
+        numbers[used + i + 1] = numbers[line + ld + width] - y
+        numbers[used + i + 2] = numbers[line + 2 * ld + width] - z
         i += 3
     while i < p:
         line, x = row[tl.C_ROWS] + i * ld, 0.0
         for k in range(p, width):
-            x += load(numbers, line + k) * load(numbers, used + k)
-        put(numbers, used + i, load(numbers, line + width) - x)
+            x += numbers[line + k] * numbers[used + k]
+        numbers[used + i] = numbers[line + width] - x
         i += 1
     while i >= 3:
         i -= 3
         line = row[tl.C_ROWS] + i * ld
-        x, y, z = load(numbers, used + i), load(numbers, used + i + 1), load(numbers, used + i + 2)
+        x, y, z = numbers[used + i], numbers[used + i + 1], numbers[used + i + 2]
         for k in range(i + 3, p):
-            known = load(numbers, used + k)
-            x -= load(numbers, line + k) * known
-            y -= load(numbers, line + ld + k) * known
-            z -= load(numbers, line + 2 * ld + k) * known
-        z *= load(shares, i + 2)
-        y = (y - load(numbers, line + ld + i + 2) * z) * load(shares, i + 1)
-        x = (x - load(numbers, line + i + 2) * z - load(numbers, line + i + 1) * y) * load(shares, i)
-        put(numbers, used + i, x)
-        put(numbers, used + i + 1, y)
-        put(numbers, used + i + 2, z)
+            known = numbers[used + k]
+            x -= numbers[line + k] * known
+            y -= numbers[line + ld + k] * known
+            z -= numbers[line + 2 * ld + k] * known
+        z *= shares[i + 2]
+        y = (y - numbers[line + ld + i + 2] * z) * shares[i + 1]
+        x = (x - numbers[line + i + 2] * z - numbers[line + i + 1] * y) * shares[i]
+        numbers[used + i] = x
+        numbers[used + i + 1] = y
+        numbers[used + i + 2] = z
     while i > 0:
         i -= 1
-        line, x = row[tl.C_ROWS] + i * ld, load(numbers, used + i)
+        line, x = row[tl.C_ROWS] + i * ld, numbers[used + i]
         for k in range(i + 1, p):
-            x -= load(numbers, line + k) * load(numbers, used + k)
-        put(numbers, used + i, x * load(shares, i))
+            x -= numbers[line + k] * numbers[used + k]
+        numbers[used + i] = x * shares[i]
 
 
 @inline_kernel
@@ -303,8 +301,8 @@ def move_frontals(graph: Graph, tree: Tree, row: I64, delta: F64, lin: F64, befo
         v = lists[s]
         d, differs = var[v, at.V_SCALAR], False
         for a in range(dim_of_variable(var, v)):
-            differs |= load(numbers, solved) - load(delta, d + a) != 0.0
-            put(delta, d + a, load(numbers, solved))
+            differs |= numbers[solved] - delta[d + a] != 0.0
+            delta[d + a] = numbers[solved]
             solved += 1
         if differs:
             move_variable(graph, tree, v, delta, lin, before)

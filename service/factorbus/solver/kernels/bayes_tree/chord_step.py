@@ -32,8 +32,6 @@ from factorbus.solver.kernels.bayes_tree.seen_in_space import seen_se3
 from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work, work_of_solving_all
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_one_of_many
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, make_scratch
@@ -138,9 +136,9 @@ def correct_se2(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     et = p[k + 2] * r[0] + p[k + 4] * r[1] + p[k + 5] * r[2]
     last = last_of_hessian(f, var, fac, tree.link)
     for a in range(3):
-        put(hessian, last - 6 + a, -(A[0, a] * ex + A[1, a] * ey + A[2, a] * et))
-        put(hessian, last - 3 + a, -(B[0, a] * ex + B[1, a] * ey + B[2, a] * et))
-    put(hessian, last, r[0] * ex + r[1] * ey + r[2] * et)
+        hessian[last - 6 + a] = -(A[0, a] * ex + A[1, a] * ey + A[2, a] * et)
+        hessian[last - 3 + a] = -(B[0, a] * ex + B[1, a] * ey + B[2, a] * et)
+    hessian[last] = r[0] * ex + r[1] * ey + r[2] * et
 
 
 @part
@@ -177,22 +175,22 @@ def correct_se3(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     nx, ny, nz = 0.5 * (w * e[3] + sx), 0.5 * (w * e[4] + sy), 0.5 * (w * e[5] + sz)
     last = last_of_hessian(f, var, fac, tree.link)
     g = last - 12
-    put(hessian, g, fx)
-    put(hessian, g + 1, fy)
-    put(hessian, g + 2, fz)
-    put(hessian, g + 3, dy * fz - dz * fy + z0 * nx + z1 * ny + z2 * nz)
-    put(hessian, g + 4, dz * fx - dx * fz + z3 * nx + z4 * ny + z5 * nz)
-    put(hessian, g + 5, dx * fy - dy * fx + z6 * nx + z7 * ny + z8 * nz)
+    hessian[g] = fx
+    hessian[g + 1] = fy
+    hessian[g + 2] = fz
+    hessian[g + 3] = dy * fz - dz * fy + z0 * nx + z1 * ny + z2 * nz
+    hessian[g + 4] = dz * fx - dx * fz + z3 * nx + z4 * ny + z5 * nz
+    hessian[g + 5] = dx * fy - dy * fx + z6 * nx + z7 * ny + z8 * nz
     # Rᵢ, then Rⱼᵀ, take the force to the second pose.
     tx, ty, tz = a0 * fx + a1 * fy + a2 * fz, a3 * fx + a4 * fy + a5 * fz, a6 * fx + a7 * fy + a8 * fz
     a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, j + 3)
-    put(hessian, g + 6, -(a0 * tx + a3 * ty + a6 * tz))
-    put(hessian, g + 7, -(a1 * tx + a4 * ty + a7 * tz))
-    put(hessian, g + 8, -(a2 * tx + a5 * ty + a8 * tz))
-    put(hessian, g + 9, -0.5 * (w * e[3] - sx))
-    put(hessian, g + 10, -0.5 * (w * e[4] - sy))
-    put(hessian, g + 11, -0.5 * (w * e[5] - sz))
-    put(hessian, last, chi2)
+    hessian[g + 6] = -(a0 * tx + a3 * ty + a6 * tz)
+    hessian[g + 7] = -(a1 * tx + a4 * ty + a7 * tz)
+    hessian[g + 8] = -(a2 * tx + a5 * ty + a8 * tz)
+    hessian[g + 9] = -0.5 * (w * e[3] - sx)
+    hessian[g + 10] = -0.5 * (w * e[4] - sy)
+    hessian[g + 11] = -0.5 * (w * e[5] - sz)
+    hessian[last] = chi2
 
 
 @part
@@ -243,7 +241,7 @@ def gather_right_side(graph: Graph, tree: Tree, row: I64, eta: F64) -> None:
                 add_to(eta, node[i, tl.N_COLUMN], hessian, g, di)
             if j >= 0 and var[j, at.V_COLUMN] >= 0:
                 add_to(eta, node[j, tl.N_COLUMN], hessian, g + di, dj)
-            eta[last] += load(hessian, g + di + dj)
+            eta[last] += hessian[g + di + dj]
             f = link[f, tl.L_OWN]
     child = row[tl.C_CHILD]
     while child >= 0:
@@ -253,9 +251,9 @@ def gather_right_side(graph: Graph, tree: Tree, row: I64, eta: F64) -> None:
         for s in range(start, start + other[tl.C_SEPARATORS]):
             into = node[lists[s], tl.N_COLUMN]
             for a in range(dim_of_variable(var, lists[s])):
-                eta[into + a] += load(numbers, source + fr.update_row(x, wide))
+                eta[into + a] += numbers[source + fr.update_row(x, wide)]
                 x += 1
-        eta[last] += load(numbers, source + fr.update_row(m, wide))
+        eta[last] += numbers[source + fr.update_row(m, wide)]
         child = other[tl.C_NEXT]
 
 
@@ -263,7 +261,7 @@ def gather_right_side(graph: Graph, tree: Tree, row: I64, eta: F64) -> None:
 def add_to(eta: F64, into: int, hessian: F64, g: int, count: int) -> None:
     """eta[into : into+count] += hessian[g : g+count]"""
     for a in range(count):
-        eta[into + a] += load(hessian, g + a)
+        eta[into + a] += hessian[g + a]
 
 
 @part
@@ -273,11 +271,11 @@ def solve_right_side(row: I64, numbers: F64, eta: F64) -> None:
     last = p + m
     for k in range(p):
         line = row[tl.C_ROWS] + k * ld
-        d = eta[k] / load(numbers, line + k)
+        d = eta[k] / numbers[line + k]
         for c in range(k + 1, last):
-            put(eta, c, load(eta, c) - load(numbers, line + c) * d)
+            eta[c] -= numbers[line + c] * d
         eta[last] -= d * d
-        put(numbers, line + last, d)
+        numbers[line + last] = d
     into, wide = row[tl.C_UPDATE] + m, row[tl.C_WIDTH_UPDATE]
     for a in range(m + 1):
-        put(numbers, into + fr.update_row(a, wide), eta[p + a])
+        numbers[into + fr.update_row(a, wide)] = eta[p + a]

@@ -11,8 +11,6 @@ from factorbus.solver.kernels.bayes_tree.hessian_room import jacobian_at, kept_s
 from factorbus.solver.kernels.bayes_tree.imu_error import residual_of_imu
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, loss_code, residual_size
 from factorbus.solver.kernels.model.many import linearize_kept
@@ -66,11 +64,11 @@ def correct_inertial(f: int, graph: Graph, tree: Tree) -> None:
     for a in range(dim):
         row, left = k + dim + a * columns, r[a]
         for c in range(columns):
-            left -= load(hessian, row + c) * load(moved, c)
-        put(hessian, k + a, left)
+            left -= hessian[row + c] * moved[c]
+        hessian[k + a] = left
         chi2 += left * left
         for c in range(columns):
-            put(gradient, c, load(gradient, c) - load(hessian, row + c) * left)
+            gradient[c] -= hessian[row + c] * left
     # The first row has the gradients of its two variables, each further one that of its second.
     c = 0
     for n in range(ends):
@@ -79,6 +77,6 @@ def correct_inertial(f: int, graph: Graph, tree: Tree) -> None:
         if n == 0:
             g -= dim_of(var[end_of(f, 1, fac), at.V_KIND])
         for e in range(size):
-            put(hessian, g + e, gradient[c + e])
+            hessian[g + e] = gradient[c + e]
         c += size
-    put(hessian, last_of_hessian(f, var, fac, link), chi2)
+    hessian[last_of_hessian(f, var, fac, link)] = chi2

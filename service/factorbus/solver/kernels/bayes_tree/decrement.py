@@ -20,8 +20,6 @@ from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
 from factorbus.solver.kernels.bayes_tree.work import RELINEARIZING, SCANNING, note_work, work_of_solving
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many, row_of_pair
 from factorbus.solver.kernels.model.linearize import Scratch, make_scratch
@@ -123,18 +121,18 @@ def subtract_model(graph: Graph, tree: Tree, row: int, x: F64, gradient: bool, o
     h, eta = tree.link[row, tl.L_AT], last_of_hessian(row, var, fac, tree.link) - di - dj
     across, second, sign = h + di * di, h + di * di + di * dj, 1.0 if gradient else 0.0
     for a in range(di if s >= 0 else 0):
-        total = -sign * load(hessian, eta + a)
+        total = -sign * hessian[eta + a]
         for b in range(di):
-            total += load(hessian, h + a * di + b) * x[s + b]
+            total += hessian[h + a * di + b] * x[s + b]
         for b in range(dj if t >= 0 else 0):
-            total += load(hessian, across + a * dj + b) * x[t + b]
+            total += hessian[across + a * dj + b] * x[t + b]
         out[s + a] -= total
     for b in range(dj if t >= 0 else 0):
-        total = -sign * load(hessian, eta + di + b)
+        total = -sign * hessian[eta + di + b]
         for a in range(di if s >= 0 else 0):
-            total += load(hessian, across + a * dj + b) * x[s + a]
+            total += hessian[across + a * dj + b] * x[s + a]
         for a in range(dj):
-            total += load(hessian, second + b * dj + a) * x[t + a]
+            total += hessian[second + b * dj + a] * x[t + a]
         out[t + b] -= total
 
 
@@ -149,11 +147,11 @@ def solve_forwards(graph: Graph, tree: Tree, cliques: I64, g: F64) -> float:
         p, width, ld = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS], row[tl.C_LD]
         for i in range(p):
             line = row[tl.C_ROWS] + i * ld
-            d = eta[i] / load(numbers, line + i)
+            d = eta[i] / numbers[line + i]
             square += d * d
-            put(eta, i, d)
+            eta[i] = d
             for c in range(i + 1, width):
-                put(eta, c, load(eta, c) - load(numbers, line + c) * d)
+                eta[c] -= numbers[line + c] * d
         scatter(row, graph.var, tree.lists, eta, g)
     return square
 
@@ -171,8 +169,8 @@ def solve_backwards(graph: Graph, tree: Tree, cliques: I64, d: F64) -> None:
             line = row[tl.C_ROWS] + i * ld
             total = x[i]
             for c in range(i + 1, width):
-                total -= load(numbers, line + c) * load(x, c)
-            put(x, i, total / load(numbers, line + i))
+                total -= numbers[line + c] * x[c]
+            x[i] = total / numbers[line + i]
         scatter(row, graph.var, tree.lists, x, d)
 
 

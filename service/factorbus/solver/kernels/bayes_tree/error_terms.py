@@ -45,7 +45,6 @@ and both ends move.  As a bound the force counts as well, (9.31) in `exact_error
 import math
 
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_camera, lens_at
 from factorbus.solver.lenses.layout import FU
@@ -60,9 +59,9 @@ SEEN = 0.45
 def turn_of(kind: int, delta: F64, d: int) -> float:
     """The angle by which δ at offset d turns a pose; 0 of a point."""
     if kind == at.SE2:
-        return abs(load(delta, d + 2))
+        return abs(delta[d + 2])
     if kind == at.SE3:
-        a, b, c = load(delta, d + 3), load(delta, d + 4), load(delta, d + 5)
+        a, b, c = delta[d + 3], delta[d + 4], delta[d + 5]
         return math.sqrt(a * a + b * b + c * c)
     return 0.0
 
@@ -72,7 +71,7 @@ def shift_between(planar: bool, x: int, y: int, values: F64, lin: F64) -> float:
     """|sⱼ − sᵢ| of the values at offsets x and y."""
     total = 0.0
     for a in range(2 if planar else 3):
-        gap = load(values, y + a) - load(lin, y + a) - (load(values, x + a) - load(lin, x + a))
+        gap = values[y + a] - lin[y + a] - (values[x + a] - lin[x + a])
         total += gap * gap
     return math.sqrt(total)
 

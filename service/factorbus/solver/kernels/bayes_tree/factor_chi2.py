@@ -15,7 +15,6 @@ from factorbus.solver.kernels.bayes_tree.imu_error import chi2_of_imu
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.seen_in_space import between_se3_chi2, is_isotropic_in_space
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import is_one_of_many
 from factorbus.solver.kernels.model.linearize import evaluate_apart
@@ -50,27 +49,27 @@ def between_se2_chi2(
     Where Ω is the same for a translation in all directions the frame of the measurement does not matter.
     """
     x, y, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
-    tx, ty = load(values, y) - load(values, x), load(values, y + 1) - load(values, x + 1)
-    ex, ey = c * tx + s * ty - load(payload, k), c * ty - s * tx - load(payload, k + 1)
-    turn = wrap(load(values, y + 2) - load(values, x + 2) - load(payload, k + 2))
+    tx, ty = values[y] - values[x], values[y + 1] - values[x + 1]
+    ex, ey = c * tx + s * ty - payload[k], c * ty - s * tx - payload[k + 1]
+    turn = wrap(values[y + 2] - values[x + 2] - payload[k + 2])
     gap = ex * ex + ey * ey
     form = factor_errors[f, tl.E_FORM]
     if form == tl.ISOTROPIC or form == tl.ISOTROPIC + tl.CORRECTED:
-        return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, gap
-    cz, sz = math.cos(load(payload, k + 2)), math.sin(load(payload, k + 2))
+        return float(payload[k + 3] * gap + payload[k + 8] * turn * turn), float(gap)
+    cz, sz = math.cos(payload[k + 2]), math.sin(payload[k + 2])
     rx, ry = cz * ex + sz * ey, cz * ey - sz * ex
-    cross = load(payload, k + 4) * rx * ry + (load(payload, k + 5) * rx + load(payload, k + 7) * ry) * turn
-    square = load(payload, k + 3) * rx * rx + load(payload, k + 6) * ry * ry + load(payload, k + 8) * turn * turn
-    return square + 2.0 * cross, gap
+    cross = payload[k + 4] * rx * ry + (payload[k + 5] * rx + payload[k + 7] * ry) * turn
+    square = payload[k + 3] * rx * rx + payload[k + 6] * ry * ry + payload[k + 8] * turn * turn
+    return float(square + 2.0 * cross), float(gap)
 
 
 @inline_kernel
 def landmark_se2_chi2(f: int, c: float, s: float, var: I64, fac: I64, values: F64, payload: F64) -> float:
     """(3.3)"""
     x, y, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
-    tx, ty = load(values, y) - load(values, x), load(values, y + 1) - load(values, x + 1)
-    ex, ey = c * tx + s * ty - load(payload, k), c * ty - s * tx - load(payload, k + 1)
-    return load(payload, k + 2) * ex * ex + 2.0 * load(payload, k + 3) * ex * ey + load(payload, k + 4) * ey * ey
+    tx, ty = values[y] - values[x], values[y + 1] - values[x + 1]
+    ex, ey = c * tx + s * ty - payload[k], c * ty - s * tx - payload[k + 1]
+    return float(payload[k + 2] * ex * ex + 2.0 * payload[k + 3] * ex * ey + payload[k + 4] * ey * ey)
 
 
 @part
@@ -99,9 +98,9 @@ def heading_of(v: int, planar: bool, var: I64, delta: F64, values: F64, turns: F
     if not planar:
         return 1.0, 0.0
     d = var[v, at.V_SCALAR]
-    angle = load(delta, d + 2) if d >= 0 else 0.0
+    angle = delta[d + 2] if d >= 0 else 0.0
     if not abs(angle) < SMALL_ANGLE:
-        theta = load(values, var[v, at.V_AT] + 2)
+        theta = values[var[v, at.V_AT] + 2]
         return math.cos(theta), math.sin(theta)
     c, s = small_turn(angle)
     c0, s0 = turns[v, tl.U_COS], turns[v, tl.U_SIN]

@@ -11,8 +11,7 @@ from factorbus.solver.kernels.bayes_tree.hessian_room import hessian_size, keep_
 from factorbus.solver.kernels.bayes_tree.imu_error import is_plain_imu
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import Panel, put, six
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import Panel, six
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, loss_code
 from factorbus.solver.kernels.model.kinds import is_camera
@@ -96,7 +95,7 @@ def linearize_rows(graph: Graph, tree: Tree, f: int) -> None:
     var, fac, out, link, state, totals = graph.var, graph.fac, tree.hessian, tree.link, tree.state, tree.totals
     more, many = linearize_kept(f, var, fac, tree.lin[0], graph.payload, kept_samples(f, var, fac, tree))
     last = link[f, tl.L_AT] + hessian_size(width_of(0, many), width_of(1, many)) - 1
-    was, chi2 = load(out, last), more + square_of(many)
+    was, chi2 = out[last], more + square_of(many)
     write_hessian_rows(f, many, chi2, link, out)
     keep_jacobian(f, graph, tree, many)
     if f < state[tl.S_TAKEN] and not has_free(f, var, fac):
@@ -149,7 +148,7 @@ def _write_between_se3(graph: Graph, tree: Tree, f: int, more: float, scratch: S
     for a in range(6):
         e = 0.0
         for b in range(6):
-            e += load(M, 6 * a + b) * r[b]
+            e += M[6 * a + b] * r[b]
         chi2 += r[a] * e
     for a in range(6):
         six(M, Panel(6 * a, 1, 6), J, 0, J, 72 + 6 * a)
@@ -166,7 +165,7 @@ def _write_between_se3(graph: Graph, tree: Tree, f: int, more: float, scratch: S
         r[a] = -r[a]
     six(r, Panel(0, 1, 6), J, 72, out, h + 108)
     six(r, Panel(0, 1, 6), J, 108, out, h + 114)
-    put(out, h + 120, chi2)
+    out[h + 120] = chi2
 
 
 @inline_kernel
@@ -193,7 +192,7 @@ def _write(graph: Graph, tree: Tree, f: int, dr: int, di: int, dj: int, more: fl
     h = _gradient(dr, di, WA, r, h, out)
     if dj > 0:
         h = _gradient(dr, dj, WB, r, h, out)
-    put(out, h, chi2)
+    out[h] = chi2
 
 
 @inline_kernel
@@ -204,7 +203,7 @@ def _product(dr: int, d: int, e: int, A: F64, WB: F64, h: int, out: F64) -> int:
             total = 0.0
             for k in range(dr):
                 total += A[k, a] * WB[k, b]
-            put(out, h + a * e + b, total)
+            out[h + a * e + b] = total
     return h + d * e
 
 
@@ -215,7 +214,7 @@ def _gradient(dr: int, d: int, WA: F64, r: F64, h: int, out: F64) -> int:
         total = 0.0
         for k in range(dr):
             total += WA[k, a] * r[k]
-        put(out, h + a, -total)
+        out[h + a] = -total
     return h + d
 
 

@@ -4,8 +4,7 @@ import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, Block, Panel, put, tile, zero
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, Block, Panel, tile, zero
 from factorbus.solver.kernels.model.factor_rows import row_of_pair
 from factorbus.solver.kernels.model.many import Many, width_of
 
@@ -31,7 +30,7 @@ def write_hessian_rows(f: int, many: Many, chi2: float, link: I64, out: F64) -> 
             h = _copy_diagonal(n == 0 and m < ends, w, Block(M + t * ld + t, ld), dj, h, out)
             h = _copy_gradient(first, w, M + s * ld + columns, ld, di, h, out)
             h = _copy_gradient(n == 0 and m < ends, w, M + t * ld + columns, ld, dj, h, out)
-            put(out, h, chi2 if first else 0.0)
+            out[h] = chi2 if first else 0.0
 
 
 @part
@@ -43,10 +42,10 @@ def multiplied(many: Many, ld: int) -> tuple[F64, int]:
     J = many.J.reshape(dim * columns)
     for a in range(dim):
         for c in range(columns):
-            put(w, a * ld + c, load(J, a * columns + c))
-        put(w, a * ld + columns, load(many.r, a))
+            w[a * ld + c] = J[a * columns + c]
+        w[a * ld + columns] = many.r[a]
         for c in range(columns + 1, ld):
-            put(w, a * ld + c, 0.0)
+            w[a * ld + c] = 0.0
     zero(w, M, columns * ld)
     for i in range(0, columns, TILE_ROWS):
         rows, j = min(TILE_ROWS, columns - i), i // LANES * LANES
@@ -62,7 +61,7 @@ def _copy(w: F64, block: Block, rows: int, columns: int, h: int, out: F64) -> in
     """A block of JᵀJ above the diagonal, row by row, from h on; gives where it ends."""
     for i in range(rows):
         for j in range(columns):
-            put(out, h + i * columns + j, -load(w, block.start + i * block.ld + j))
+            out[h + i * columns + j] = -w[block.start + i * block.ld + j]
     return h + rows * columns
 
 
@@ -74,9 +73,9 @@ def _copy_diagonal(has: bool, w: F64, block: Block, rows: int, h: int, out: F64)
         return h + rows * rows
     for i in range(rows):
         for j in range(i, rows):
-            value = -load(w, block.start + i * block.ld + j)
-            put(out, h + i * rows + j, value)
-            put(out, h + j * rows + i, value)
+            value = -w[block.start + i * block.ld + j]
+            out[h + i * rows + j] = value
+            out[h + j * rows + i] = value
     return h + rows * rows
 
 
@@ -84,5 +83,5 @@ def _copy_diagonal(has: bool, w: F64, block: Block, rows: int, h: int, out: F64)
 def _copy_gradient(has: bool, w: F64, start: int, ld: int, count: int, h: int, out: F64) -> int:
     """−Jᵀ r of a variable, or zeros."""
     for i in range(count):
-        put(out, h + i, load(w, start + i * ld) if has else 0.0)
+        out[h + i] = w[start + i * ld] if has else 0.0
     return h + count

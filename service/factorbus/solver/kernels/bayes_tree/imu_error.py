@@ -12,8 +12,7 @@ from factorbus.proto import inertial as of
 from factorbus.solver.kernels.bayes_tree.hessian_room import jacobian_at, kept_samples
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put, zero
+from factorbus.solver.kernels.jit.simd import zero
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, form_of_imu, loss_code
 from factorbus.solver.kernels.model.imu import BIAS_A, IMU_SCRATCH, ImuScratch, imu_of_delta, put_delta_near
@@ -41,9 +40,9 @@ def is_plain_imu(f: int, fac: I64, payload: F64) -> bool:
         return False
     p, off = fac[f, at.F_AT] + numbers_of_imu(form_of_imu(f, fac)), 0.0
     for n in range(_DIM * (_DIM + 1) // 2):
-        off += abs(load(payload, p + n))
+        off += abs(payload[p + n])
     for a in range(_DIM):
-        off += abs(load(payload, p) - 1.0) - abs(load(payload, p))
+        off += abs(payload[p] - 1.0) - abs(payload[p])
         p += _DIM - a
     return off == 0.0
 
@@ -121,8 +120,8 @@ def exact_error_of_imu(f: int, graph: Graph, tree: Tree) -> tuple[float, float, 
     for m in range(SIZE):
         total = 0.0
         for i in range(m, SIZE):
-            total += load(graph.payload, root + i * (i + 1) // 2 + m) * load(w, i)
-        put(w, _TURNS + m, total)
+            total += graph.payload[root + i * (i + 1) // 2 + m] * w[i]
+        w[_TURNS + m] = total
 
     # 2. How far its variables are from where it is linearized.
     c = 0
@@ -130,7 +129,7 @@ def exact_error_of_imu(f: int, graph: Graph, tree: Tree) -> tuple[float, float, 
         v = end_of(f, n, fac)
         d, size = var[v, at.V_SCALAR], dim_of(var[v, at.V_KIND])
         for e in range(size):
-            put(w, _MOVED + c + e, tree.scalars[0, d + e] if d >= 0 else 0.0)
+            w[_MOVED + c + e] = tree.scalars[0, d + e] if d >= 0 else 0.0
         c += size
 
     # 3. What the model misses of the residual, and of (W P)ᵀ r.
@@ -166,14 +165,14 @@ def miss_rows(first: int, end: int, k: int, a: int, columns: int, linear: F64, w
     squares of J add to their columns.
     """
     i, j = k + _DIM + a * columns, _P + a * columns
-    r0, r1, r2 = load(w, a), load(w, a + 1), load(w, a + 2)
-    t0, t1, t2 = load(w, _TURNS + a), load(w, _TURNS + a + 1), load(w, _TURNS + a + 2)
+    r0, r1, r2 = w[a], w[a + 1], w[a + 2]
+    t0, t1, t2 = w[_TURNS + a], w[_TURNS + a + 1], w[_TURNS + a + 2]
     g0 = g1 = g2 = 0.0
     for c in range(first, end):
-        moved = load(w, _MOVED + c)
-        s0, s1, s2 = load(linear, i + c), load(linear, i + columns + c), load(linear, i + 2 * columns + c)
+        moved = w[_MOVED + c]
+        s0, s1, s2 = linear[i + c], linear[i + columns + c], linear[i + 2 * columns + c]
         g0, g1, g2 = g0 + s0 * moved, g1 + s1 * moved, g2 + s2 * moved
-        now = load(w, j + c) * t0 + load(w, j + columns + c) * t1 + load(w, j + 2 * columns + c) * t2
-        put(w, _TURNED + c, load(w, _TURNED + c) + now - s0 * r0 - s1 * r1 - s2 * r2)
-        put(w, _DIAGONAL + c, load(w, _DIAGONAL + c) + s0 * s0 + s1 * s1 + s2 * s2)
+        now = w[j + c] * t0 + w[j + columns + c] * t1 + w[j + 2 * columns + c] * t2
+        w[_TURNED + c] += now - s0 * r0 - s1 * r1 - s2 * r2
+        w[_DIAGONAL + c] += s0 * s0 + s1 * s1 + s2 * s2
     return g0, g1, g2

@@ -17,7 +17,6 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.seen_in_space import error_quaternion
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix, turn_slope
@@ -44,7 +43,7 @@ def missed_error_se2(graph: Graph, tree: Tree, f: int) -> tuple[float, float, fl
 @inline_kernel
 def turn_since_linearized(i: int, var: I64, delta: F64) -> float:
     """φ of plane pose i; 0 of a fixed one."""
-    return load(delta, var[i, at.V_SCALAR] + 2) if var[i, at.V_SCALAR] >= 0 else 0.0
+    return float(delta[var[i, at.V_SCALAR] + 2]) if var[i, at.V_SCALAR] >= 0 else 0.0
 
 
 @inline_kernel
@@ -52,8 +51,8 @@ def missed_se2(x: int, y: int, phi: float, values: F64, lin: F64) -> tuple[float
     """R₀ times (9.33), of the plane poses at offsets x and y, so in the map's frame; of the angle nothing is missed.
     And the squares of what y has shifted by as x has not, and as seen from x.
     """
-    tx, ty = load(values, y) - load(values, x), load(values, y + 1) - load(values, x + 1)
-    sx, sy = tx - (load(lin, y) - load(lin, x)), ty - (load(lin, y + 1) - load(lin, x + 1))
+    tx, ty = values[y] - values[x], values[y + 1] - values[x + 1]
+    sx, sy = tx - (lin[y] - lin[x]), ty - (lin[y + 1] - lin[x + 1])
     versed, late = versed_and_late(phi)
     bx, by = -versed * tx - late * ty + phi * sy, -versed * ty + late * tx - phi * sx
     sine, moved = phi - late, sx * sx + sy * sy

@@ -3,8 +3,6 @@
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import move_idp
 from factorbus.solver.kernels.model.points import move_point2, move_point3, move_vector
@@ -29,7 +27,7 @@ def move_variable(graph: Graph, tree: Tree, v: int, delta: F64, lin: F64, before
         changed[state[tl.S_CHANGED]] = v
         state[tl.S_CHANGED] += 1
         for a in range(size_of(kind)):
-            put(before, x + a, load(values, x + a))
+            before[x + a] = values[x + a]
     if kind == at.SE2:
         turn_se2(lin, x, turns[v, tl.U_COS], turns[v, tl.U_SIN], delta, var[v, at.V_SCALAR], values)
     else:

@@ -8,7 +8,6 @@ from factorbus.solver.kernels.bayes_tree.linearization_error import measure
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.jit.compile import I64, kernel
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import size_of
@@ -40,7 +39,7 @@ def reset_to_linearization(graph_table: I64, tree_table: I64) -> None:
             scalars[0, d + a] = 0.0
         if c >= 0 and node[v, tl.N_PLACE] == 0:
             for k in range(clique[c, tl.C_PIVOTS] + clique[c, tl.C_SEPARATOR_SCALARS]):
-                put(numbers, clique[c, tl.C_USED] + k, 0.0)
+                numbers[clique[c, tl.C_USED] + k] = 0.0
             for k in range(tl.M_WIDTH):
                 motions[c * tl.M_WIDTH + k] = 0.0
             clique[c, tl.C_MOVES] = 0

@@ -18,8 +18,6 @@ from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, PLACE, move
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.scratch import free_since, scratch_used, take
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.jit.sorting import put_in_order
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_rigid
@@ -65,12 +63,12 @@ def fit_motion(
         d = var[v, at.V_SCALAR]
         displace(v, var, lin, turns, motion, WHOLE, motion)
         for a in range(dim_of_variable(var, v)):
-            gap = load(delta, d + a) - load(numbers, used) - load(motion, LOCAL + a)
-            if not gap * gap * load(weight, d + a) <= far:
+            gap = delta[d + a] - numbers[used] - motion[LOCAL + a]
+            if not gap * gap * weight[d + a] <= far:
                 return False
             used += 1
     for a in range(MOTION):
-        motion[FRESH + a] = motion[WHOLE + a] - (load(motions, since + a) if row[tl.C_MOVES] & tl.MOVED != 0 else 0.0)
+        motion[FRESH + a] = motion[WHOLE + a] - (motions[since + a] if row[tl.C_MOVES] & tl.MOVED != 0 else 0.0)
     return True
 
 
@@ -79,19 +77,19 @@ def fit_plane(graph: Graph, tree: Tree, first: int, last: int, used: int, delta:
     """ξ nearest to how the variables moved, by the weights of their first scalars."""
     var = graph.var
     lists, numbers, lin, turns = tree.lists, tree.numbers, tree.lin[0], tree.turns
-    x0, y0 = load(lin, var[lists[first], at.V_AT]), load(lin, var[lists[first], at.V_AT] + 1)
+    x0, y0 = lin[var[lists[first], at.V_AT]], lin[var[lists[first], at.V_AT] + 1]
     mass = px = py = ux = uy = inertia = torque = 0.0
     for s in range(first, last):
         v = lists[s]
         d, x = var[v, at.V_SCALAR], var[v, at.V_AT]
-        w, dx, dy = load(weight, d), load(lin, x) - x0, load(lin, x + 1) - y0
-        gx, gy = load(delta, d) - load(numbers, used), load(delta, d + 1) - load(numbers, used + 1)
+        w, dx, dy = weight[d], lin[x] - x0, lin[x + 1] - y0
+        gx, gy = delta[d] - numbers[used], delta[d + 1] - numbers[used + 1]
         used += 2
         if var[v, at.V_KIND] == at.SE2:
-            c, z, turn_weight = turns[v, tl.U_COS], turns[v, tl.U_SIN], load(weight, d + 2)
+            c, z, turn_weight = turns[v, tl.U_COS], turns[v, tl.U_SIN], weight[d + 2]
             gx, gy = c * gx - z * gy, z * gx + c * gy
             inertia += turn_weight
-            torque += turn_weight * (load(delta, d + 2) - load(numbers, used))
+            torque += turn_weight * (delta[d + 2] - numbers[used])
             used += 1
         mass += w
         px += w * dx
@@ -111,13 +109,13 @@ def fit_plane(graph: Graph, tree: Tree, first: int, last: int, used: int, delta:
 @inline_kernel
 def moved_in_space(d: int, place: int, x: int, kind: int, numbers: F64, delta: F64, lin: F64) -> tuple:
     """How a variable moved and turned, in the map's frame."""
-    gx, gy = load(delta, d) - load(numbers, place), load(delta, d + 1) - load(numbers, place + 1)
-    gz = load(delta, d + 2) - load(numbers, place + 2)
+    gx, gy = delta[d] - numbers[place], delta[d + 1] - numbers[place + 1]
+    gz = delta[d + 2] - numbers[place + 2]
     if kind != at.SE3:
         return gx, gy, gz, 0.0, 0.0, 0.0
     a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, x + 3)
-    hx, hy = load(delta, d + 3) - load(numbers, place + 3), load(delta, d + 4) - load(numbers, place + 4)
-    hz = load(delta, d + 5) - load(numbers, place + 5)
+    hx, hy = delta[d + 3] - numbers[place + 3], delta[d + 4] - numbers[place + 4]
+    hz = delta[d + 5] - numbers[place + 5]
     return (
         a0 * gx + a1 * gy + a2 * gz,
         a3 * gx + a4 * gy + a5 * gz,
@@ -134,16 +132,16 @@ def fit_space(graph: Graph, tree: Tree, first: int, last: int, used: int, delta:
     var = graph.var
     lists, numbers, lin = tree.lists, tree.numbers, tree.lin[0]
     origin = var[lists[first], at.V_AT]
-    x0, y0, z0 = load(lin, origin), load(lin, origin + 1), load(lin, origin + 2)
+    x0, y0, z0 = lin[origin], lin[origin + 1], lin[origin + 2]
     mass = px = py = pz = ux = uy = uz = 0.0
     xx = xy = xz = yy = yz = zz = bx = by = bz = 0.0
     for s in range(first, last):
         v = lists[s]
-        d, x, w = var[v, at.V_SCALAR], var[v, at.V_AT], load(weight, var[v, at.V_SCALAR])
+        d, x, w = var[v, at.V_SCALAR], var[v, at.V_AT], weight[var[v, at.V_SCALAR]]
         gx, gy, gz, hx, hy, hz = moved_in_space(d, used, x, var[v, at.V_KIND], numbers, delta, lin)
-        turn_weight = load(weight, d + 3) if var[v, at.V_KIND] == at.SE3 else 0.0
+        turn_weight = weight[d + 3] if var[v, at.V_KIND] == at.SE3 else 0.0
         used += dim_of_variable(var, v)
-        qx, qy, qz = load(lin, x) - x0, load(lin, x + 1) - y0, load(lin, x + 2) - z0
+        qx, qy, qz = lin[x] - x0, lin[x + 1] - y0, lin[x + 2] - z0
         mass += w
         px += w * qx
         py += w * qy
@@ -185,17 +183,17 @@ def displace(v: int, var: I64, lin: F64, turns: F64, given: F64, xi: int, motion
     """motion[LOCAL :] = J ξ of variable v, ξ at offset xi of `given`."""
     kind, x = var[v, at.V_KIND], var[v, at.V_AT]
     if kind == at.SE2 or kind == at.POINT2:
-        turn = load(given, xi + 5)
-        gx, gy = load(given, xi) - turn * load(lin, x + 1), load(given, xi + 1) + turn * load(lin, x)
+        turn = given[xi + 5]
+        gx, gy = given[xi] - turn * lin[x + 1], given[xi + 1] + turn * lin[x]
         if kind == at.SE2:
             c, z = turns[v, tl.U_COS], turns[v, tl.U_SIN]
             gx, gy = c * gx + z * gy, c * gy - z * gx
         motion[LOCAL], motion[LOCAL + 1], motion[LOCAL + 2] = gx, gy, turn
         return
-    ox, oy, oz = load(given, xi + 3), load(given, xi + 4), load(given, xi + 5)
-    px, py, pz = load(lin, x), load(lin, x + 1), load(lin, x + 2)
-    gx, gy = load(given, xi) + oy * pz - oz * py, load(given, xi + 1) + oz * px - ox * pz
-    gz = load(given, xi + 2) + ox * py - oy * px
+    ox, oy, oz = given[xi + 3], given[xi + 4], given[xi + 5]
+    px, py, pz = lin[x], lin[x + 1], lin[x + 2]
+    gx, gy = given[xi] + oy * pz - oz * py, given[xi + 1] + oz * px - ox * pz
+    gz = given[xi + 2] + ox * py - oy * px
     if kind == at.SE3:
         a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, x + 3)
         gx, gy, gz = a0 * gx + a3 * gy + a6 * gz, a1 * gx + a4 * gy + a7 * gz, a2 * gx + a5 * gy + a8 * gz
@@ -218,12 +216,12 @@ def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, li
     while True:
         row, since = clique[c], c * tl.M_WIDTH
         for a in range(MOTION):
-            before = load(motions, since + a) if row[tl.C_MOVES] & tl.MOVED != 0 else 0.0
-            put(motions, since + a, before + motion[FRESH + a])
+            before = motions[since + a] if row[tl.C_MOVES] & tl.MOVED != 0 else 0.0
+            motions[since + a] = before + motion[FRESH + a]
         row[tl.C_MOVES] |= tl.MOVED
-        wx, wy, wz = load(motions, since + 3), load(motions, since + 4), load(motions, since + 5)
-        put(motions, since + tl.M_BODY, float(body))
-        put(motions, since + tl.M_TURN, math.sqrt(wx * wx + wy * wy + wz * wz))
+        wx, wy, wz = motions[since + 3], motions[since + 4], motions[since + 5]
+        motions[since + tl.M_BODY] = float(body)
+        motions[since + tl.M_TURN] = math.sqrt(wx * wx + wy * wy + wz * wz)
         listed[count] = c
         count += 1
         if count >= end:
@@ -271,10 +269,10 @@ def move_bodies(graph: Graph, tree: Tree, listed: I64, quiet: float, delta: F64,
     for k in range(n):
         v = variables[k]
         since, kind, d = node[v, tl.N_CLIQUE] * tl.M_WIDTH, var[v, at.V_KIND], var[v, at.V_SCALAR]
-        displace(v, var, lin, turns, motion, TABLE + int(load(motions, since + tl.M_BODY)) * MOTION, motion)
+        displace(v, var, lin, turns, motion, TABLE + int(motions[since + tl.M_BODY]) * MOTION, motion)
         for a in range(dim_of_variable(var, v)):
-            put(delta, d + a, load(delta, d + a) + motion[LOCAL + a])
+            delta[d + a] += motion[LOCAL + a]
         move_variable(graph, tree, v, delta, lin, before)
-        lever_error = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * load(motions, since + tl.M_TURN)
+        lever_error = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * motions[since + tl.M_TURN]
         note_moved(MODEL if lever_error > quiet else PLACE, v, node, moved, state)
     free_since(taken, tree.scratch)

@@ -11,8 +11,7 @@ import numpy as np
 
 from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put, zero
+from factorbus.solver.kernels.jit.simd import zero
 from factorbus.solver.kernels.jit.sorting import sort
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import graph_at
@@ -108,7 +107,7 @@ def take_fronts(order: I64, dims: I64, starts: I64, fronts: I64, separator: I64,
             for i in range(dim):
                 zero(numbers, put_row, i)
                 for j in range(i, row[WIDTH]):
-                    put(numbers, put_row + j, load(arena, source + i * ld + j))
+                    numbers[put_row + j] = arena[source + i * ld + j]
                 put_row += row[WIDTH]
     counts[POSITIONS], counts[SCALARS], counts[INDEX], counts[NUMBERS] = n, scalar, put_list, put_row
 
@@ -154,12 +153,12 @@ def solve_block_rows(rows_table: I64, d: F64, x: F64, delta: F64) -> None:
         for i in range(dim - 1, -1, -1):
             line, total = base + i * ld, 0.0
             for j in range(dim, width):
-                total += load(numbers, line + j) * load(row_of_x, j)
+                total += numbers[line + j] * row_of_x[j]
             for j in range(i + 1, dim):
-                total += load(numbers, line + j) * load(x, row[SCALAR] + j)
-            put(x, row[SCALAR] + i, (load(d, row[SCALAR] + i) - total) / load(numbers, line + i))
+                total += numbers[line + j] * x[row[SCALAR] + j]
+            x[row[SCALAR] + i] = (d[row[SCALAR] + i] - total) / numbers[line + i]
         for i in range(dim):
-            put(delta, row[START] + i, load(x, row[SCALAR] + i))
+            delta[row[START] + i] = x[row[SCALAR] + i]
 
 
 @inline_kernel
@@ -169,7 +168,7 @@ def gather_row(row: I64, index: I64, rec: I64, x: F64, out: F64) -> None:
     for e in range(row[LIST] + 1, row[LIST] + row[COUNT]):
         other = rec[index[e]]
         for c in range(other[DIM]):
-            put(out, j, load(x, other[SCALAR] + c))
+            out[j] = x[other[SCALAR] + c]
             j += 1
 
 
@@ -182,31 +181,31 @@ def solve_block_rows_transposed(rows_table: I64, eta: F64, d: F64) -> float:
     for k in range(counts[POSITIONS]):
         row = rec[k]
         for i in range(row[DIM]):
-            put(d, row[SCALAR] + i, load(eta, row[START] + i))
+            d[row[SCALAR] + i] = eta[row[START] + i]
     total = 0.0
     for k in range(counts[POSITIONS]):
         row = rec[k]
         dim, width, base, ld, s = row[DIM], row[WIDTH], row[ROW], row[LD], row[SCALAR]
         for i in range(dim):
-            y = load(d, s + i) / load(numbers, base + i * ld + i)
-            put(d, s + i, y)
+            y = d[s + i] / numbers[base + i * ld + i]
+            d[s + i] = y
             total += y * y
             for j in range(i + 1, dim):
-                put(d, s + j, load(d, s + j) - load(numbers, base + i * ld + j) * y)
+                d[s + j] -= numbers[base + i * ld + j] * y
             line = base + i * ld
             if i == 0:
                 for j in range(dim, width):
-                    put(taken, j, load(numbers, line + j) * y)
+                    taken[j] = numbers[line + j] * y
             else:
                 for j in range(dim, width):
-                    put(taken, j, load(taken, j) + load(numbers, line + j) * y)
+                    taken[j] += numbers[line + j] * y
         j = dim
         for e in range(row[LIST] + 1, row[LIST] + row[COUNT]):
             other = rec[index[e]]
             for c in range(other[DIM]):
-                put(d, other[SCALAR] + c, load(d, other[SCALAR] + c) - load(taken, j))
+                d[other[SCALAR] + c] -= taken[j]
                 j += 1
-    return total
+    return float(total)
 
 
 @kernel("void(int64[::1], int64[::1], float64[::1])")
@@ -221,7 +220,7 @@ def compact_rows(rows_table: I64, new_index: I64, new_numbers: F64) -> None:
             new_index[put_list + e] = index[row[LIST] + e]
         size = row[DIM] * row[LD]
         for j in range(size):
-            put(new_numbers, put_row + j, load(numbers, row[ROW] + j))
+            new_numbers[put_row + j] = numbers[row[ROW] + j]
         row[LIST], row[ROW] = put_list, put_row
         put_list += row[ROOM]
         put_row += size
@@ -268,7 +267,7 @@ def move_blocks(new: BlockList, old: BlockList, rec: I64, a: F64, source: int, t
         if e >= 0 and old.positions[old.first + e] == position:
             x -= dim
             for c in range(dim - 1, -1, -1):
-                put(a, target + y + c, load(a, source + x + c))
+                a[target + y + c] = a[source + x + c]
             e -= 1
         else:
             zero(a, target + y, dim)

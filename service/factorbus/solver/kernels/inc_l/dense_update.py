@@ -8,8 +8,6 @@ import numpy as np
 from factorbus.solver.kernels.inc_l import block_rows as br
 from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.jit.small_cholesky import cholesky
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import end_of, is_member, is_one_of_many
@@ -69,10 +67,10 @@ def read_trailing(reached: I64, start: I64, rows: BlockRows, T: F64, y: F64) -> 
                 u += 1
             for c in range(rec[index[e], br.DIM]):
                 for i in range(row[br.DIM]):
-                    T[start[t] + i, start[u] + c] = load(numbers, row[br.ROW] + i * row[br.LD] + x)
+                    T[start[t] + i, start[u] + c] = numbers[row[br.ROW] + i * row[br.LD] + x]
                 x += 1
         for i in range(row[br.DIM]):
-            y[start[t] + i] = load(d, row[br.SCALAR] + i)
+            y[start[t] + i] = d[row[br.SCALAR] + i]
 
 
 @part
@@ -164,5 +162,5 @@ def write_trailing(reached: I64, start: I64, size: int, M: F64, z: F64, rows: Bl
         for i in range(row[br.DIM]):
             for c in range(width):
                 value = M[start[t] + i, start[t] + c] if c >= i else 0.0
-                put(numbers, row[br.ROW] + i * row[br.LD] + c, value)
-            put(d, row[br.SCALAR] + i, z[start[t] + i])
+                numbers[row[br.ROW] + i * row[br.LD] + c] = value
+            d[row[br.SCALAR] + i] = z[start[t] + i]

@@ -12,8 +12,7 @@ import numpy as np
 from factorbus.solver.kernels.inc_l import block_rows as br
 from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put, zero
+from factorbus.solver.kernels.jit.simd import zero
 from factorbus.solver.kernels.jit.sorting import sort
 from factorbus.solver.kernels.sparse.partial_cholesky import PIVOT_TOLERANCE
 
@@ -158,7 +157,7 @@ def fill_row(j: int, own: I64, pattern: I64, data: F64, eta: F64, rows: BlockRow
         x += rec[index[e], br.DIM]
     for i in range(row[br.DIM]):
         zero(numbers, row[br.ROW] + i * row[br.LD], row[br.WIDTH])
-        put(d, row[br.SCALAR] + i, load(eta, row[br.START] + i))
+        d[row[br.SCALAR] + i] = eta[row[br.START] + i]
     for e in range(own.size):
         b = own[e]
         a, c, source = place[pattern[0, b]], place[pattern[1, b]], pattern[2, b]
@@ -167,8 +166,8 @@ def fill_row(j: int, own: I64, pattern: I64, data: F64, eta: F64, rows: BlockRow
         for i in range(height):
             for q in range(width):
                 turned = a != j
-                value = load(data, source + (q * height + i if turned else i * width + q))
-                put(numbers, target + i * row[br.LD] + q, value)
+                value = data[source + (q * height + i if turned else i * width + q)]
+                numbers[target + i * row[br.LD] + q] = value
 
 
 @part
@@ -178,10 +177,10 @@ def take_product(j: int, k: int, entry: int, offset: int, rows: BlockRows, where
     row, other = rec[j], rec[k]
     height, base, ld = row[br.DIM], other[br.ROW], other[br.LD]
     for q in range(other[br.DIM]):
-        y = load(d, other[br.SCALAR] + q)
+        y = d[other[br.SCALAR] + q]
         for i in range(height):
             scalar = row[br.SCALAR] + i
-            put(d, scalar, load(d, scalar) - load(numbers, base + q * ld + offset + i) * y)
+            d[scalar] -= numbers[base + q * ld + offset + i] * y
     e, last, x = entry, other[br.COUNT], offset
     while e < last:
         target = where[index[other[br.LIST] + e]]
@@ -195,9 +194,9 @@ def take_product(j: int, k: int, entry: int, offset: int, rows: BlockRows, where
         for i in range(height):
             line = row[br.ROW] + i * row[br.LD] + target
             for q in range(other[br.DIM]):
-                factor, from_ = load(numbers, base + q * ld + offset + i), base + q * ld + source
+                factor, from_ = numbers[base + q * ld + offset + i], base + q * ld + source
                 for c in range(width):
-                    put(numbers, line + c, load(numbers, line + c) - factor * load(numbers, from_ + c))
+                    numbers[line + c] -= factor * numbers[from_ + c]
 
 
 @inline_kernel
@@ -205,7 +204,7 @@ def load_floor(dim: int, source: int, data: F64) -> float:
     """The least pivot allowed in a row of `dim` scalars whose diagonal block of Λ is at data[source]."""
     least = math.inf
     for i in range(dim):
-        least = min(least, load(data, source + i * dim + i))
+        least = min(least, data[source + i * dim + i])
     return PIVOT_TOLERANCE * least
 
 
@@ -216,17 +215,17 @@ def factor_row(row: I64, floor: float, numbers: F64, d: F64) -> bool:
     for i in range(dim):
         line = base + i * ld
         for q in range(i):
-            factor = load(numbers, base + q * ld + i)
+            factor = numbers[base + q * ld + i]
             for c in range(i, width):
-                put(numbers, line + c, load(numbers, line + c) - factor * load(numbers, base + q * ld + c))
-            put(d, scalar + i, load(d, scalar + i) - factor * load(d, scalar + q))
-        pivot = load(numbers, line + i)
+                numbers[line + c] -= factor * numbers[base + q * ld + c]
+            d[scalar + i] -= factor * d[scalar + q]
+        pivot = numbers[line + i]
         if not (pivot > floor and pivot > 0.0 and pivot < math.inf):
             return False
         scale = 1.0 / math.sqrt(pivot)
         for c in range(i, width):
-            put(numbers, line + c, load(numbers, line + c) * scale)
+            numbers[line + c] = numbers[line + c] * scale
         for c in range(i):
-            put(numbers, line + c, 0.0)
-        put(d, scalar + i, load(d, scalar + i) * scale)
+            numbers[line + c] = 0.0
+        d[scalar + i] = d[scalar + i] * scale
     return True

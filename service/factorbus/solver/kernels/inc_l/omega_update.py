@@ -15,8 +15,7 @@ import numpy as np
 from factorbus.solver.kernels.inc_l import block_rows as br
 from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put, zero
+from factorbus.solver.kernels.jit.simd import zero
 from factorbus.solver.kernels.jit.sorting import sort
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import (
@@ -155,7 +154,7 @@ def whiten(f: int, k: int, graph: Graph, rows: BlockRows, union: I64, scratch: S
                 total = 0.0
                 for b in range(a, dim):
                     total += C[a, b] * H[end, b, c]
-                put(W, (k + a) * ld + offset + c, total)
+                W[(k + a) * ld + offset + c] = total
     return k + dim
 
 
@@ -178,7 +177,7 @@ def write_rows(
         for a in range(dim):
             to = (k + a) * ld + offset
             for c in range(width_of(n, many)):
-                put(whitened.W, to + c, many.J[a, many.start[n] + c])
+                whitened.W[to + c] = many.J[a, many.start[n] + c]
     return k + dim
 
 
@@ -252,9 +251,9 @@ def reflect(row: I64, height: int, skip: int, whitened: WhitenedRows, rows: Bloc
     x, v, scale = made.x, made.v, made.scale
     dim, base, step, scalar = row[br.DIM], row[br.ROW], row[br.LD], row[br.SCALAR]
     for a in range(dim):
-        alpha, sigma = load(numbers, base + a * step + a), 0.0
+        alpha, sigma = numbers[base + a * step + a], 0.0
         for k in range(height):
-            x[a, k] = load(W, k * ld + skip + a)
+            x[a, k] = W[k * ld + skip + a]
             sigma += x[a, k] * x[a, k]
         pivot = math.sqrt(alpha * alpha + sigma)
         if not (pivot > 0.0 and pivot < math.inf):
@@ -263,20 +262,20 @@ def reflect(row: I64, height: int, skip: int, whitened: WhitenedRows, rows: Bloc
         v[a] = -sigma / (alpha + pivot)
         length = sigma + v[a] * v[a]
         scale[a] = 2.0 / length if length > 0.0 else 0.0
-        put(numbers, base + a * step + a, pivot)
+        numbers[base + a * step + a] = pivot
         for c in range(a + 1, dim):
-            total = v[a] * load(numbers, base + a * step + c)
+            total = v[a] * numbers[base + a * step + c]
             for k in range(height):
-                total += x[a, k] * load(W, k * ld + skip + c)
+                total += x[a, k] * W[k * ld + skip + c]
             total *= scale[a]
-            put(numbers, base + a * step + c, load(numbers, base + a * step + c) - v[a] * total)
+            numbers[base + a * step + c] -= v[a] * total
             for k in range(height):
-                put(W, k * ld + skip + c, load(W, k * ld + skip + c) - x[a, k] * total)
-        total = v[a] * load(d, scalar + a)
+                W[k * ld + skip + c] -= x[a, k] * total
+        total = v[a] * d[scalar + a]
         for k in range(height):
             total += x[a, k] * rhs[k]
         total *= scale[a]
-        put(d, scalar + a, load(d, scalar + a) - v[a] * total)
+        d[scalar + a] -= v[a] * total
         for k in range(height):
             rhs[k] -= x[a, k] * total
     return True
@@ -292,24 +291,24 @@ def apply(
         line = row[br.ROW] + a * row[br.LD] + left
         va, sa, base = v[a], scale[a], skip + left
         for c in range(width):
-            put(s, c, va * load(numbers, line + c))
+            s[c] = va * numbers[line + c]
         k = 0
         while k + 3 <= height:
             x0, x1, x2 = x[a, k], x[a, k + 1], x[a, k + 2]
             w0, w1, w2 = k * ld + base, (k + 1) * ld + base, (k + 2) * ld + base
             for c in range(width):
-                put(s, c, load(s, c) + x0 * load(W, w0 + c) + x1 * load(W, w1 + c) + x2 * load(W, w2 + c))
+                s[c] += x0 * W[w0 + c] + x1 * W[w1 + c] + x2 * W[w2 + c]
             k += 3
         while k < height:
             x0, w0 = x[a, k], k * ld + base
             for c in range(width):
-                put(s, c, load(s, c) + x0 * load(W, w0 + c))
+                s[c] += x0 * W[w0 + c]
             k += 1
         for c in range(width):
-            put(s, c, load(s, c) * sa)
+            s[c] = s[c] * sa
         for c in range(width):
-            put(numbers, line + c, load(numbers, line + c) - va * load(s, c))
+            numbers[line + c] -= va * s[c]
         for k in range(height):
             x0, w0 = x[a, k], k * ld + base
             for c in range(width):
-                put(W, w0 + c, load(W, w0 + c) - x0 * load(s, c))
+                W[w0 + c] -= x0 * s[c]

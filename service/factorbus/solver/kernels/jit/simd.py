@@ -1,7 +1,5 @@
-"""Loads, stores and register tiles on a float64 array, written in LLVM vectors.
-
-Why not plain indexing: `a[i + j]` with signed indices compiles to a compare and a select for negative ones, which
-keeps loops from being vectorized, and no compiler keeps a tile of a product in registers by itself.
+"""Register tiles and runs of a float64 array, written in LLVM vectors: no compiler keeps a tile of a product in
+registers by itself.
 
 There are three sets of these functions with one meaning: `simd_llvm` (fast, no checks), `simd_checked` (the same
 behind range checks, NUMBA_BOUNDSCHECK=1) and `simd_plain` (NumPy, NUMBA_DISABLE_JIT=1; read that one first).
@@ -11,11 +9,11 @@ from factorbus.solver.kernels.jit.compile import BOUNDSCHECK, DISABLED, vector_l
 from factorbus.solver.kernels.jit.simd_plain import Block, Panel
 
 if DISABLED:
-    from factorbus.solver.kernels.jit.simd_plain import add_run, at, put, six, solve_tile, tile, zero
+    from factorbus.solver.kernels.jit.simd_plain import add_run, six, solve_tile, tile, zero
 elif BOUNDSCHECK:
-    from factorbus.solver.kernels.jit.simd_checked import add_run, at, put, six, solve_tile, tile, zero
+    from factorbus.solver.kernels.jit.simd_checked import add_run, six, solve_tile, tile, zero
 else:
-    from factorbus.solver.kernels.jit.simd_llvm import add_run, at, put, six, solve_tile, tile, zero
+    from factorbus.solver.kernels.jit.simd_llvm import add_run, six, solve_tile, tile, zero
 
 __all__ = [
     "LANES",
@@ -24,8 +22,6 @@ __all__ = [
     "Block",
     "Panel",
     "add_run",
-    "at",
-    "put",
     "six",
     "solve_tile",
     "tile",

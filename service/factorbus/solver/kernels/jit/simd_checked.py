@@ -1,31 +1,17 @@
 """The functions of `simd` behind range checks: what NUMBA_BOUNDSCHECK=1 runs."""
 
-from typing import Any
-
 from factorbus.solver.kernels.jit import simd_llvm
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, vector_lanes
 from factorbus.solver.kernels.jit.simd_plain import Block, Panel
 
 _LANES = vector_lanes()
-_at, _put, _zero, _add_run = simd_llvm.at, simd_llvm.put, simd_llvm.zero, simd_llvm.add_run
+_zero, _add_run = simd_llvm.zero, simd_llvm.add_run
 _tile, _solve_tile, _six = simd_llvm.tile, simd_llvm.solve_tile, simd_llvm.six
 
 
 @inline_kernel
-def at(a: F64, i: int) -> Any:
-    """See `simd_plain`; likewise below."""
-    _within(a, i, 1)
-    return _at(a, i)
-
-
-@inline_kernel
-def put(a: F64, i: int, x: float) -> None:
-    _within(a, i, 1)
-    _put(a, i, x)
-
-
-@inline_kernel
 def zero(a: F64, i: int, count: int) -> None:
+    """See `simd_plain`; likewise below."""
     _within(a, i, count)
     _zero(a, i, count)
 

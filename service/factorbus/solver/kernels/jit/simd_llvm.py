@@ -14,27 +14,6 @@ _INT = types.int64
 
 
 @intrinsic
-def at(_typing: Any, a: Any, _i: Any) -> Any:
-    """a[i]"""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(_address(context, builder, signature, args[0], args[1]))
-
-    return types.float64(a, _INT), emit
-
-
-@intrinsic
-def put(_typing: Any, a: Any, _i: Any, _x: Any) -> Any:
-    """a[i] = x"""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], _address(context, builder, signature, args[0], args[1]))
-        return context.get_dummy_value()
-
-    return types.void(a, _INT, types.float64), emit
-
-
-@intrinsic
 def zero(_typing: Any, a: Any, _i: Any, _count: Any) -> Any:
     """a[i : i+count] = 0"""
 

@@ -24,16 +24,6 @@ class Panel(NamedTuple):
     depth: int
 
 
-def at(a: F64, i: int) -> float:
-    """a[i]"""
-    return a[i]
-
-
-def put(a: F64, i: int, x: float) -> None:
-    """a[i] = x"""
-    a[i] = x
-
-
 def zero(a: F64, i: int, count: int) -> None:
     """a[i : i+count] = 0"""
     a[i : i + count] = 0.0

@@ -17,8 +17,6 @@ import numpy as np
 
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.imu_walk import BIAS, LANES, P_A, P_G, V_A, V_G, P, R, S, V, Walk
 from factorbus.solver.kernels.model.preintegration import (
@@ -153,28 +151,28 @@ def _expand(base: F64, b: int, k: int, d: F64, n: int, bias: F64, room: F64) -> 
     d0, d1, d2 = bias[0] - base[b], bias[1] - base[b + 1], bias[2] - base[b + 2]
     a0, a1, a2 = bias[3] - base[b + 3], bias[4] - base[b + 4], bias[5] - base[b + 5]
     for c in range(of.BIAS):
-        put(room, c, load(bias, c))
+        room[c] = bias[c]
     for c in range(of.DELTA):
-        put(room, ROOM_T + c, load(base, k + c))
+        room[ROOM_T + c] = base[k + c]
     for c in range(SLOPES):
         # M = J′[δ_g]
-        slope = d0 * load(d, n + c) + d1 * load(d, n + SLOPES + c) + d2 * load(d, n + 2 * SLOPES + c)
-        put(M, c, slope)
-        put(room, ROOM_R_B + c, load(room, ROOM_R_B + c) + slope)
+        slope = d0 * d[n + c] + d1 * d[n + SLOPES + c] + d2 * d[n + 2 * SLOPES + c]
+        M[c] = slope
+        room[ROOM_R_B + c] += slope
     for a in range(3):
         # By J + M less half of it.
         i, m = ROOM_R_B + 3 * a, 3 * a
-        theta = (load(room, i) - 0.5 * load(M, m)) * d0 + (load(room, i + 1) - 0.5 * load(M, m + 1)) * d1
-        put(M, SLOPES + a, theta + (load(room, i + 2) - 0.5 * load(M, m + 2)) * d2)
+        theta = (room[i] - 0.5 * M[m]) * d0 + (room[i + 1] - 0.5 * M[m + 1]) * d1
+        M[SLOPES + a] = theta + (room[i + 2] - 0.5 * M[m + 2]) * d2
         for to, i, m in ((ROOM_P + a, ROOM_P_B + 6 * a, 9 + 6 * a), (ROOM_V + a, ROOM_V_B + 6 * a, 27 + 6 * a)):
-            turned = (load(room, i) - 0.5 * load(M, m)) * d0 + (load(room, i + 1) - 0.5 * load(M, m + 1)) * d1
-            turned += (load(room, i + 2) - 0.5 * load(M, m + 2)) * d2
-            pushed = load(room, i + 3) * a0 + load(room, i + 4) * a1 + load(room, i + 5) * a2
-            put(room, to, load(room, to) + turned + pushed)
+            turned = (room[i] - 0.5 * M[m]) * d0 + (room[i + 1] - 0.5 * M[m + 1]) * d1
+            turned += (room[i + 2] - 0.5 * M[m + 2]) * d2
+            pushed = room[i + 3] * a0 + room[i + 4] * a1 + room[i + 5] * a2
+            room[to] += turned + pushed
             for c in range(3):
                 e = n + SLOPES * c + m + 3
-                slope = load(d, e) * a0 + load(d, e + 1) * a1 + load(d, e + 2) * a2
-                put(room, i + c, load(room, i + c) + slope)
+                slope = d[e] * a0 + d[e + 1] * a1 + d[e + 2] * a2
+                room[i + c] += slope
     x, y, w, q = M[SLOPES], M[SLOPES + 1], M[SLOPES + 2], ROOM_Q
     half, ew = half_turn(x * x + y * y + w * w)
     room[q], room[q + 1], room[q + 2], room[q + 3] = quat_product(

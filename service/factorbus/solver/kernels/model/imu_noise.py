@@ -15,8 +15,6 @@ import numpy as np
 
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model.imu_walk import (
     LANES,
     T_B,
@@ -69,13 +67,13 @@ def propagate_noise(z: F64, walk: Walk) -> F64:
     v = w[V * LANES], w[(V + 1) * LANES], w[(V + 2) * LANES]
     isotropic = drifts = spreads = steps = 0.0  # Σ s h, and what accelerometers and integration add
     for k in range(0, trace.size, T_WIDTH):
-        left, h = load(trace, k + T_LEFT), load(trace, k + T_H)
+        left, h = trace[k + T_LEFT], trace[k + T_H]
         reach = left + 0.5 * h
         steps, drifts, spreads = steps + h, drifts + h * reach, spreads + h * reach * reach
         d = _less(v, trace, k + T_V, 1.0, (0.0, 0.0, 0.0))
         c = _less(p, trace, k + T_V, left, _three(trace, k + T_P))
         u = _three(trace, k + T_U)
-        share, square = 2.0 * load(trace, k + T_B), u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+        share, square = 2.0 * trace[k + T_B], u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
         # 1 − s is as small as θ² is.
         if square < SMALL_TURN:
             axial = 1 / 12 - square * (1 / 360 - square * (1 / 20160 - square * (1 / 1814400 - square / 239500800)))
@@ -98,16 +96,16 @@ def propagate_noise(z: F64, walk: Walk) -> F64:
 
 @inline_kernel
 def _three(a: F64, k: int) -> tuple:
-    return load(a, k), load(a, k + 1), load(a, k + 2)
+    return a[k], a[k + 1], a[k + 2]
 
 
 @inline_kernel
 def _less(x: tuple, a: F64, k: int, scale: float, y: tuple) -> tuple:
     """x − y − scale a[k : k+3]."""
     return (
-        x[0] - y[0] - scale * load(a, k),
-        x[1] - y[1] - scale * load(a, k + 1),
-        x[2] - y[2] - scale * load(a, k + 2),
+        x[0] - y[0] - scale * a[k],
+        x[1] - y[1] - scale * a[k + 1],
+        x[2] - y[2] - scale * a[k + 2],
     )
 
 
@@ -164,7 +162,7 @@ def _dot(x: tuple, y: tuple) -> float:
 
 @inline_kernel
 def _add(S: F64, k: int, x: float) -> None:
-    put(S, k, load(S, k) + x)
+    S[k] += x
 
 
 @inline_kernel

@@ -18,8 +18,6 @@ import numpy as np
 
 from factorbus.proto import inertial as of
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model.imu_layout import ImuLayout
 from factorbus.solver.kernels.model.preintegration import few_terms_of, series_of
 from factorbus.solver.kernels.model.se3 import SMALL_TURN
@@ -82,17 +80,17 @@ def turn_lanes(h: float, z: F64, k: int, w: F64) -> None:
     """By how much the sample at z[k] turns, and the series of it."""
     gx, gy, gz = z[k + 1], z[k + 2], z[k + 3]
     for m in range(LANES):
-        x, y = h * (gx - load(w, BIAS * LANES + m)), h * (gy - load(w, (BIAS + 1) * LANES + m))
-        v = h * (gz - load(w, (BIAS + 2) * LANES + m))
+        x, y = h * (gx - w[BIAS * LANES + m]), h * (gy - w[(BIAS + 1) * LANES + m])
+        v = h * (gz - w[(BIAS + 2) * LANES + m])
         q = x * x + y * y + v * v
-        put(w, _SQUARE * LANES + m, q)
+        w[_SQUARE * LANES + m] = q
         put_turned(R * LANES + m, x, y, v, _U * LANES + m, w)
         put_turned((R + 3) * LANES + m, x, y, v, (_U + 1) * LANES + m, w)
         put_turned((R + 6) * LANES + m, x, y, v, (_U + 2) * LANES + m, w)
         a, b, c = few_terms_of(q)
-        put(w, _A * LANES + m, a)
-        put(w, _B * LANES + m, b)
-        put(w, _C * LANES + m, c)
+        w[_A * LANES + m] = a
+        w[_B * LANES + m] = b
+        w[_C * LANES + m] = c
     for m in range(LANES):
         if w[_SQUARE * LANES + m] >= SMALL_TURN:
             w[_A * LANES + m], w[_B * LANES + m], w[_C * LANES + m] = series_of(w[_SQUARE * LANES + m])
@@ -101,7 +99,7 @@ def turn_lanes(h: float, z: F64, k: int, w: F64) -> None:
 @inline_kernel
 def put_turned(row: int, x: float, y: float, z: float, to: int, w: F64) -> None:
     """A row of R times (x, y, z)."""
-    put(w, to, load(w, row) * x + load(w, row + LANES) * y + load(w, row + 2 * LANES) * z)
+    w[to] = w[row] * x + w[row + LANES] * y + w[row + 2 * LANES] * z
 
 
 @inline_kernel
@@ -109,12 +107,12 @@ def add_to_lanes(h: float, ax: float, ay: float, az: float, w: F64) -> None:
     """One more sample, of the acceleration (ax, ay, az) less its bias."""
     for m in range(LANES):
         i = R * LANES + m
-        r0, r1, r2 = load(w, i), load(w, i + LANES), load(w, i + 2 * LANES)
-        r3, r4, r5 = load(w, i + 3 * LANES), load(w, i + 4 * LANES), load(w, i + 5 * LANES)
-        r6, r7, r8 = load(w, i + 6 * LANES), load(w, i + 7 * LANES), load(w, i + 8 * LANES)
+        r0, r1, r2 = w[i], w[i + LANES], w[i + 2 * LANES]
+        r3, r4, r5 = w[i + 3 * LANES], w[i + 4 * LANES], w[i + 5 * LANES]
+        r6, r7, r8 = w[i + 6 * LANES], w[i + 7 * LANES], w[i + 8 * LANES]
         f0, f1, f2 = r0 * ax + r1 * ay + r2 * az, r3 * ax + r4 * ay + r5 * az, r6 * ax + r7 * ay + r8 * az
         put_pushed(LANES, V * LANES + m, P * LANES + m, h, (f0, f1, f2), w)
-        u = load(w, _U * LANES + m), load(w, (_U + 1) * LANES + m), load(w, (_U + 2) * LANES + m)
+        u = w[_U * LANES + m], w[(_U + 1) * LANES + m], w[(_U + 2) * LANES + m]
         add_to_column(0, m, h, (f0, f1, f2), u, w)
         add_to_column(1, m, h, (f0, f1, f2), u, w)
         add_to_column(2, m, h, (f0, f1, f2), u, w)
@@ -123,24 +121,24 @@ def add_to_lanes(h: float, ax: float, ay: float, az: float, w: F64) -> None:
 @inline_kernel
 def add_to_column(c: int, m: int, h: float, f: tuple, u: tuple, w: F64) -> None:
     """The same of column c of R, of S, and of the derivatives, in lane m; f = a."""
-    g, a = c * LANES + m, load(w, _A * LANES + m)
-    b, d = load(w, _B * LANES + m), load(w, _C * LANES + m)
+    g, a = c * LANES + m, w[_A * LANES + m]
+    b, d = w[_B * LANES + m], w[_C * LANES + m]
     i, j = R * LANES + g, S * LANES + g
-    s0, s1, s2 = load(w, j), load(w, j + 3 * LANES), load(w, j + 6 * LANES)
+    s0, s1, s2 = w[j], w[j + 3 * LANES], w[j + 6 * LANES]
     # −⌊a⌋ s = s × a
     pushed = s1 * f[2] - s2 * f[1], s2 * f[0] - s0 * f[2], s0 * f[1] - s1 * f[0]
     put_pushed(3 * LANES, V_G * LANES + g, P_G * LANES + g, h, pushed, w)
-    x0, x1, x2 = load(w, i), load(w, i + 3 * LANES), load(w, i + 6 * LANES)
+    x0, x1, x2 = w[i], w[i + 3 * LANES], w[i + 6 * LANES]
     put_pushed(3 * LANES, V_A * LANES + g, P_A * LANES + g, h, (-x0, -x1, -x2), w)
     # ⌊u⌋ x and ⌊u⌋² x
     y0, y1, y2 = u[1] * x2 - u[2] * x1, u[2] * x0 - u[0] * x2, u[0] * x1 - u[1] * x0
     t0, t1, t2 = u[1] * y2 - u[2] * y1, u[2] * y0 - u[0] * y2, u[0] * y1 - u[1] * y0
-    put(w, j, s0 - h * (x0 + b * y0 + d * t0))
-    put(w, j + 3 * LANES, s1 - h * (x1 + b * y1 + d * t1))
-    put(w, j + 6 * LANES, s2 - h * (x2 + b * y2 + d * t2))
-    put(w, i, x0 + a * y0 + b * t0)
-    put(w, i + 3 * LANES, x1 + a * y1 + b * t1)
-    put(w, i + 6 * LANES, x2 + a * y2 + b * t2)
+    w[j] = s0 - h * (x0 + b * y0 + d * t0)
+    w[j + 3 * LANES] = s1 - h * (x1 + b * y1 + d * t1)
+    w[j + 6 * LANES] = s2 - h * (x2 + b * y2 + d * t2)
+    w[i] = x0 + a * y0 + b * t0
+    w[i + 3 * LANES] = x1 + a * y1 + b * t1
+    w[i + 6 * LANES] = x2 + a * y2 + b * t2
 
 
 @inline_kernel
@@ -153,6 +151,6 @@ def put_pushed(row: int, v: int, p: int, h: float, a: tuple, w: F64) -> None:
 
 @inline_kernel
 def put_one_pushed(v: int, p: int, more: float, h: float, w: F64) -> None:
-    before = load(w, v)
-    put(w, p, load(w, p) + h * (before + 0.5 * more))
-    put(w, v, before + more)
+    before = w[v]
+    w[p] += h * (before + 0.5 * more)
+    w[v] = before + more

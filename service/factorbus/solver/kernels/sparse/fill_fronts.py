@@ -1,7 +1,7 @@
 """R that was made elsewhere, put into fronts."""
 
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel
-from factorbus.solver.kernels.jit.simd import put, zero
+from factorbus.solver.kernels.jit.simd import zero
 from factorbus.solver.kernels.sparse import fronts as fr
 
 
@@ -21,8 +21,8 @@ def fill_fronts(fronts: I64, separator: I64, begin: I64, rows: I64, values: F64,
             for e in range(begin[first + i], begin[first + i + 1]):
                 row = rows[e]
                 if row < first + p:
-                    put(arena, line + row - first, values[e])
+                    arena[line + row - first] = values[e]
                 else:
                     while separator[front[fr.SEPARATOR_AT] + j] != row:
                         j += 1
-                    put(arena, line + p + j, values[e])
+                    arena[line + p + j] = values[e]

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.jit.array_table import (
     put_entry,
 )
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.kernels.jit.simd import add_run, at, put, zero
+from factorbus.solver.kernels.jit.simd import add_run, zero
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.partial_cholesky import PIVOT_TOLERANCE, factor_front
 from factorbus.solver.kernels.sparse.subtrees import END, FAILED, FIRST, SUBTREE, TURN, cut_whole
@@ -116,7 +116,7 @@ def factorize_range(plan: I64, begin: int, end: int, t: int, queue: I64) -> int:
         for b in range(record[fr.BLOCKS], record[fr.BLOCKS_END]):
             write_block(arena, blocks, b, ld, values, offsets[blocks[b, fr.BLOCK_NUMBER]], on_diagonal)
         for i in range(p):
-            floor = PIVOT_TOLERANCE * at(arena, r + i * ld + i)
+            floor = PIVOT_TOLERANCE * arena[r + i * ld + i]
             floors[i] = floor if floor > 0.0 else 0.0
         c = record[fr.CHILD]
         while c >= 0:
@@ -148,12 +148,12 @@ def write_block(a: F64, blocks: I64, b: int, ld: int, values: F64, source: int, 
     for i in range(height):
         if how == fr.TURNED:
             for j in range(width):
-                put(a, target + i * ld + j, at(values, source + j * height + i))
+                a[target + i * ld + j] = values[source + j * height + i]
         else:
             for j in range(width):
-                put(a, target + i * ld + j, at(values, source + i * width + j))
+                a[target + i * ld + j] = values[source + i * width + j]
             if how == fr.DIAGONAL:
-                put(a, target + i * ld + i, at(values, source + i * width + i) * on_diagonal)
+                a[target + i * ld + i] = values[source + i * width + i] * on_diagonal
 
 
 @inline_kernel

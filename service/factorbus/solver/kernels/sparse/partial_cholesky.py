@@ -10,7 +10,7 @@ taken off it, so every number is loaded and stored once per panel.
 import math
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, Block, Panel, at, put, solve_tile
+from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, Block, Panel, solve_tile
 from factorbus.solver.kernels.sparse.fronts import Front, padded_size
 from factorbus.solver.kernels.sparse.panels import DEPTH, take_off, take_panel_off
 from factorbus.solver.kernels.sparse.parallel_panels import is_large, take_panel_off_together
@@ -68,18 +68,18 @@ def pivot_rows(a: F64, rows: int, d: int, ld: int, floors: F64, k: int, t: int) 
     for j in range(rows):
         column = t + 4 + j * (j - 1) // 2
         for i in range(j):
-            above = at(a, d + i * ld + j)
+            above = a[d + i * ld + j]
             for q in range(i):
-                above -= at(a, t + 4 + i * (i - 1) // 2 + q) * at(a, column + q)
-            put(a, column + i, above * at(a, t + i))
-        pivot = at(a, d + j * ld + j)
+                above -= a[t + 4 + i * (i - 1) // 2 + q] * a[column + q]
+            a[column + i] = above * a[t + i]
+        pivot = a[d + j * ld + j]
         for q in range(j):
-            pivot -= at(a, column + q) ** 2
+            pivot -= a[column + q] ** 2
         floor = floors[k + j]
         if not (pivot > abs(floor) and pivot > 0.0):
             if not (floor < 0.0 and pivot <= abs(floor)):
                 return j
-            put(a, d + j * ld + j, at(a, d + j * ld + j) - floor - pivot)
+            a[d + j * ld + j] -= floor - pivot
             pivot, status = -floor, RAISED
-        put(a, t + j, 1.0 / math.sqrt(pivot))
+        a[t + j] = 1.0 / math.sqrt(pivot)
     return status

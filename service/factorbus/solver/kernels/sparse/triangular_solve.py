@@ -1,7 +1,6 @@
 """Solving with the fronts of R: RᵀR δ = η."""
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
-from factorbus.solver.kernels.jit.simd import at, put
 from factorbus.solver.kernels.sparse import fronts as fr
 
 
@@ -17,7 +16,7 @@ def solve_fronts_transposed(fronts: I64, separator: I64, arena: F64, x: F64, roo
         forward_front(arena, r, ld, p, m, x, k, room)
         b = front[fr.SEPARATOR_AT]
         for j in range(m):
-            x[separator[b + j]] -= at(room, j)
+            x[separator[b + j]] -= room[j]
 
 
 @kernel("void(int64[:,::1], int64[::1], float64[::1], float64[::1], float64[::1])")
@@ -28,7 +27,7 @@ def solve_fronts(fronts: I64, separator: I64, arena: F64, x: F64, room: F64) -> 
         r, ld, p, m, k = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.SEPARATOR], front[fr.COLUMN]
         b = front[fr.SEPARATOR_AT]
         for j in range(m):
-            put(room, j, x[separator[b + j]])
+            room[j] = x[separator[b + j]]
         backward_front(arena, r, ld, p, m, x, k, room)
 
 
@@ -37,7 +36,7 @@ def into_elimination_order(place: I64, starts: I64, dims: I64, given: F64, x: F6
     """x[place] = given, variable by variable."""
     for v in range(place.size):
         for i in range(dims[v]):
-            put(x, place[v] + i, at(given, starts[v] + i))
+            x[place[v] + i] = given[starts[v] + i]
 
 
 @kernel("void(int64[::1], int64[::1], int64[::1], float64[::1], float64[::1])")
@@ -45,22 +44,22 @@ def into_insertion_order(place: I64, starts: I64, dims: I64, x: F64, out: F64) -
     """out = x[place], variable by variable."""
     for v in range(place.size):
         for i in range(dims[v]):
-            put(out, starts[v] + i, at(x, place[v] + i))
+            out[starts[v] + i] = x[place[v] + i]
 
 
 @inline_kernel
 def forward_front(a: F64, r: int, ld: int, p: int, m: int, x: F64, k: int, room: F64) -> None:
     """x[k : k+p] = R⁻ᵀ x[k : k+p];  room[: m] = Sᵀ x[k : k+p]"""
     for j in range(m):
-        put(room, j, 0.0)
+        room[j] = 0.0
     for i in range(p):
         row = r + i * ld
-        y = at(x, k + i) / at(a, row + i)
-        put(x, k + i, y)
+        y = x[k + i] / a[row + i]
+        x[k + i] = y
         for j in range(i + 1, p):
-            put(x, k + j, at(x, k + j) - at(a, row + j) * y)
+            x[k + j] -= a[row + j] * y
         for j in range(m):
-            put(room, j, at(room, j) + at(a, row + p + j) * y)
+            room[j] += a[row + p + j] * y
 
 
 @inline_kernel
@@ -70,7 +69,7 @@ def backward_front(a: F64, r: int, ld: int, p: int, m: int, x: F64, k: int, room
         row = r + i * ld
         dot = 0.0
         for j in range(m):
-            dot += at(a, row + p + j) * at(room, j)
+            dot += a[row + p + j] * room[j]
         for j in range(i + 1, p):
-            dot += at(a, row + j) * at(x, k + j)
-        put(x, k + i, (at(x, k + i) - dot) / at(a, row + i))
+            dot += a[row + j] * x[k + j]
+        x[k + i] = (x[k + i] - dot) / a[row + i]
