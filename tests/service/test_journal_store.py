@@ -294,6 +294,31 @@ def test_a_map_is_one_file_and_back(store: Store, tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["n"], "nothing half done is left"
 
 
+def test_a_copy_has_no_checkpoint_that_its_journal_does_not_know_and_knows_of_none_that_it_has_not(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The service writes a checkpoint, and removes an older one, while the map is copied."""
+    folder = store.path.parent
+    for number in (1, 2):
+        write_checkpoint(file_of(folder, number), {"n": number})
+        store.add_checkpoint(Checkpoint(number, 1, {"sources": "here"}, "", 1), 2)
+    copy_to = Store.copy_to
+
+    def and_meanwhile(reading: Store, path: Path) -> None:
+        copy_to(reading, path)
+        write_checkpoint(file_of(folder, 3), {"n": 3})
+        for record in store.add_checkpoint(Checkpoint(3, 1, {"sources": "here"}, "", 1), 2):
+            file_of(folder, record).unlink()
+
+    monkeypatch.setattr(Store, "copy_to", and_meanwhile)
+    export_map(folder, tmp_path / "m.fbmap")
+    import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
+    again = open_store(tmp_path / "other" / "n", read_only=True)
+    assert [saved.record for saved in again.checkpoints()] == [2]
+    assert [path.name for path in (tmp_path / "other" / "n").glob("checkpoint*")] == ["checkpoint-2.fbs"]
+    again.close()
+
+
 def test_a_journal_at_work_is_neither_imported_nor_written_over(store: Store, tmp_path: Path) -> None:
     """A part of it is in its log; and who exports into its folder may name a file of it."""
     (tmp_path / "link").symlink_to(store.path)

@@ -32,7 +32,6 @@ def export_map(folder: Path, file: Path) -> int:
     try:
         beside.unlink(missing_ok=True)
         store.copy_to(beside)
-        saved = store.checkpoints()
     except OSError as error:
         raise NotWritten(file, str(error)) from None
     finally:
@@ -41,9 +40,7 @@ def export_map(folder: Path, file: Path) -> int:
         with _opened(beside) as database:
             database.execute(_TABLE)
             (revision,) = database.execute("SELECT COALESCE(MAX(revision), 0) FROM record").fetchone()
-            for each in saved:
-                if _put(database, each.record, file_of(folder, each.record)):
-                    break
+            _put_newest(database, folder)
         beside.rename(file)
         sync_folder(file.absolute().parent)
         return revision
@@ -150,6 +147,16 @@ class _Database:
                 self._connection.execute("COMMIT" if kind is None else "ROLLBACK")
         finally:
             self._connection.close()
+
+
+def _put_newest(database: sqlite3.Connection, folder: Path) -> None:
+    """The newest checkpoint that the copy knows of and that is still there; of the others it has no row either.
+
+    A service at work may have written another one since, and have removed these.
+    """
+    rows = database.execute("SELECT record FROM checkpoint ORDER BY record DESC").fetchall()
+    taken = next((record for (record,) in rows if _put(database, record, file_of(folder, record))), None)
+    database.execute("DELETE FROM checkpoint WHERE record IS NOT ?", (taken,))
 
 
 def _put(database: sqlite3.Connection, record: int, path: Path) -> bool:
