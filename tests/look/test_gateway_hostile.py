@@ -134,6 +134,45 @@ def test_fuzzed_requests_get_documented_answers_and_leave_no_traceback(
     assert seen[404] > 10
 
 
+@pytest.mark.parametrize("browser", ["reads nothing", "sends half a request", "sends an upgrade that is none"])
+def test_it_stops_with_a_browser_that(endpoint: str, spawn: Callable[..., Process], browser: str) -> None:
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("large") as joined:
+        if "x0" not in joined.estimate:
+            joined.insert(row(3000))
+        process = spawn("-m", "factorbus.cli", "gateway", "--connect", endpoint, "--port", "0")
+        port = urlsplit(process.ready()[0]).port
+        assert port is not None
+        host = f"Host: 127.0.0.1:{port}\r\n"
+        upgrade = f"GET /api/maps/large/live HTTP/1.1\r\n{host}{UPGRADE.format(key=KEY)}"
+        asked = {
+            "reads nothing": f"GET /api/maps/large/estimate HTTP/1.1\r\n{host}\r\n" * 100,
+            "sends half a request": upgrade,
+            "sends an upgrade that is none": upgrade + "X: y\r\n" * 300 + "\r\n",
+        }
+        with contextlib.ExitStack() as lines:
+            for sent in (f"{upgrade}\r\n", asked[browser]):
+                line = lines.enter_context(socket.socket())
+                line.settimeout(ANSWER_S)
+                line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)  # what is sent soon stays where it is
+                line.connect(("127.0.0.1", port))
+                line.sendall(sent.encode())
+                if "half" not in browser:
+                    assert line.recv(12) in (b"HTTP/1.1 101", b"HTTP/1.1 200", b"HTTP/1.1 400")
+            for _ in range(20):  # by then as much was answered as there is room for
+                assert answer(port, f"GET /api/maps/large/estimate HTTP/1.1\r\n{host}\r\n".encode()) == 200
+            process.signal(signal.SIGTERM)
+            assert process.wait() == 0
+    assert "Traceback" not in process.errors()
+
+
+def row(poses: int) -> Draft:
+    """A robot that drives straight on."""
+    draft = Draft().se2("x0", (0, 0, 0), fixed=True)
+    for i in range(1, poses):
+        draft.se2(f"x{i}").between_se2(f"x{i - 1}", f"x{i}", (1, 0, 0), sigmas=(0.1, 0.1, 0.1))
+    return draft
+
+
 @pytest.mark.parametrize(
     "text", ["9" * 5000, "x" + "9" * 5000, str(MAX_KEY + 1), str(MIN_KEY - 1), "-" + "9" * 5000, "x" + "9" * 18]
 )
