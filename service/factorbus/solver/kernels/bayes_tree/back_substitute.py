@@ -123,7 +123,7 @@ def note_behind(ids: I64, clique: I64, state: I64) -> None:
             roots += 1
             behind |= clique[ids[f], tl.C_MOVES] & tl.BEHIND != 0
     if behind or roots == state[tl.S_ROOTS]:
-        state[tl.S_BEHIND] += 1 if behind else 0
+        state[tl.S_BEHIND] = state[tl.S_BEHIND] + 1 if behind else 0
 
 
 @inline_kernel
