@@ -79,7 +79,7 @@ def pivot_rows(a: F64, rows: int, d: int, ld: int, floors: F64, k: int, t: int) 
         if not (pivot > abs(floor) and pivot > 0.0):
             if not (floor < 0.0 and pivot <= abs(floor)):
                 return j
-            a[d + j * ld + j] -= floor - pivot
+            a[d + j * ld + j] = a[d + j * ld + j] - floor - pivot
             pivot, status = -floor, RAISED
         a[t + j] = 1.0 / math.sqrt(pivot)
     return status
