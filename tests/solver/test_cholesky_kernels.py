@@ -11,7 +11,7 @@ from factorbus.solver.kernels.jit import simd_plain
 from factorbus.solver.kernels.jit.simd import LANES, Block, Panel, add_run, six, solve_tile, tile, zero
 from factorbus.solver.kernels.sparse.fronts import GROUP, SCRATCH, Front, padded_size, update_row, update_size
 from factorbus.solver.kernels.sparse.panels import DEPTH
-from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
+from factorbus.solver.kernels.sparse.partial_cholesky import RAISED, factor_front
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 
 
@@ -38,6 +38,28 @@ def test_floors_are_the_least_pivots():
     front = np.diag([4.0, 9.0, 16.0])
     assert run(front, 3, np.array([3.9, 8.9, 15.9]))[0] == -1
     assert run(front, 3, np.array([3.9, 9.0, 15.9]))[0] == 1
+
+
+@given(st.integers(1, 30), st.integers(0, 12), st.data())
+def test_a_raised_pivot_is_its_floor_and_the_rest_follows_from_it(p, m, data):
+    at, floor = data.draw(st.integers(0, p - 1)), data.draw(st.sampled_from([1e-3, 1.0, 30.0]))
+    root = np.triu(np.random.default_rng(p).normal(size=(p + m, p + m))) + 5.0 * np.eye(p + m)
+    root[at, at] = floor**0.5
+    raised = root.T @ root
+    front, floors = raised.copy(), np.zeros(p)
+    front[at, at] -= data.draw(st.sampled_from([1.5, 1.0, 0.5])) * floor
+    floors[at] = -floor
+    failed, rows, update = run(front, p, floors)
+    assert failed == RAISED
+    expected_rows, expected_update = partial_cholesky(raised, p)
+    np.testing.assert_allclose(np.triu(rows), expected_rows, atol=1e-7)
+    np.testing.assert_allclose(np.triu(update), np.triu(expected_update), atol=1e-6)
+
+
+def test_only_a_pivot_below_its_floor_is_raised():
+    front = np.diag([4.0, 9.0])
+    assert run(front, 2, np.array([-3.9, -8.9]))[0] == -1
+    assert run(front, 2, np.array([-3.9, -9.1]))[0] == RAISED
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 4])
