@@ -157,7 +157,8 @@ def _product(a: Sequence[Operand], b: Sequence[Operand]) -> list[Operand]:
 
 
 def _unit(q: Sequence[Operand]) -> list[Operand]:
-    scale = over(1.0, root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
+    """1/|q| of what is a unit but for rounding, by one step of Newton's method: its own error is the square of that."""
+    scale = 1.5 - 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return [scale * x for x in q]
 
 

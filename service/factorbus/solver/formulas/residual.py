@@ -1,27 +1,31 @@
-"""The function of a kind in LLVM's language: its residual, and the Jacobian of that.  MATH §3.11.
+"""The function of a kind in LLVM's language: its residual, and what is made of its Jacobian.  MATH §3.11.
 
-    function(x, var, fac, z, out, slopes) -> NO_NUMBER, RESIDUAL or BOTH: what is a number of at most MOST_RESIDUAL
+    function(x, var, fac, z, out, asked, was, information, delta) -> NO_NUMBER, RESIDUAL or BOTH
 
-x: all values; var: the table of variables; fac: the rows of the factor; z: what is measured; out: r
-(dim,), and behind it J (dim, scalars), row by row, written where `slopes` is not 0, with room for a vector register
-after it.
+x: all values; var: the table of variables; fac: the rows of the factor; z: what is measured; out: r (dim,).  What is
+given says what of r and J is a number of at most MOST_RESIDUAL.  asked: SLOPES, behind r also J
+(dim, scalars), row by row, with room for a vector register after it; ERROR, how far both are from the linear model
+that is kept, see `error_code`, which the last three arguments are for; SQUARE, rᵀ Ω r alone, which is what is given
+then, −∞ where r is none: nothing is written.
 
 The numbers come first.  Then the slopes, forward mode: for as many scalars of the variables at once as a vector
 register has lanes, in a loop from the last scalars to the first, so that what a row's last vector writes beyond the
 row is written anew.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from factorbus.proto.expressions.declaration import CONSTANT, Declaration, ExpressionNode
 from factorbus.proto.expressions.operations import SO3, Type, tangent_size, value_size
 from factorbus.solver.formulas import groups, vectors
+from factorbus.solver.formulas.error_code import ErrorCode
 from factorbus.solver.formulas.groups import Dual
 from factorbus.solver.formulas.terms import DOUBLE, INTEGER, LANES, NO_SLOPE, WIDE, Code, Operand, Term
 from factorbus.solver.kernels.jit.compile import ir
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.expressions import BOTH, NO_NUMBER, RESIDUAL
+from factorbus.solver.kernels.model.expressions import BOTH, ERROR, NO_NUMBER, RESIDUAL, SQUARE
 
 # A residual beyond it, or a slope, is no number to add to a sum of squares.
 MOST_RESIDUAL = 1e12
@@ -33,25 +37,28 @@ _NUMBER, _WORD, _BITS = DOUBLE.as_pointer(), INTEGER.as_pointer(), ir.VectorType
 def residual_code(declared: Declaration) -> str:
     """The module with the function."""
     module = ir.Module(NAME)
-    kind = ir.FunctionType(INTEGER, [_NUMBER, _WORD, _WORD, _NUMBER, _NUMBER, INTEGER])
+    kind = ir.FunctionType(INTEGER, [_NUMBER, _WORD, _WORD, _NUMBER, _NUMBER, INTEGER, _NUMBER, _NUMBER, _NUMBER])
     function = ir.Function(module, kind, NAME)
-    x, var, fac, z, out, slopes = function.args
-    entry, loop, end = (function.append_basic_block(name) for name in ("numbers", "slopes", "end"))
-    at_entry, in_loop, at_end = map(ir.IRBuilder, (entry, loop, end))
+    x, var, fac, z, out, asked, was, information, delta = function.args
+    names = ["numbers", "square", "residual", "begin_error", "slopes", "store", "add_error", "next", "all"]
+    names += ["end_error", "end"]
+    blocks = {name: function.append_basic_block(name) for name in names}
+    at_block = {name: ir.IRBuilder(block) for name, block in blocks.items()}
+    at_entry, in_loop, at_next = at_block["numbers"], at_block["slopes"], at_block["next"]
     code = Code(module, at_entry, in_loop)
+    sizes = [tangent_size(kind) for kind in declared.types[: len(declared.variables)]]
 
     # 1. What is known: the variables, with a slope of 1 at each of their scalars, and what is measured.
-    blocks = -(-declared.scalars // LANES)
+    last = INTEGER(-(-declared.scalars // LANES) - 1)
     block, all_within = in_loop.phi(INTEGER, "block"), in_loop.phi(_BITS, "within")
     known: list[Dual] = []
-    scalar = 0
-    for n, kind in enumerate(declared.types[: len(declared.variables)]):
+    rows: list[Any] = []
+    for n, size in enumerate(sizes):
         v = at_entry.load(at_entry.gep(fac, [INTEGER(at.F_I if n == 0 else (n - 1) * at.F_WIDTH + at.F_J)]))
-        row = at_entry.mul(v, INTEGER(at.V_WIDTH))
-        place = at_entry.load(at_entry.gep(var, [at_entry.add(row, INTEGER(at.V_AT))]))
-        d = [_seed(code, block, scalar + c) for c in range(tangent_size(kind))]
-        known.append(Dual(_loaded(code, x, place, value_size(kind)), d))
-        scalar += tangent_size(kind)
+        rows.append(at_entry.mul(v, INTEGER(at.V_WIDTH)))
+        place = at_entry.load(at_entry.gep(var, [at_entry.add(rows[n], INTEGER(at.V_AT))]))
+        d = [_seed(code, block, sum(sizes[:n]) + c) for c in range(size)]
+        known.append(Dual(_loaded(code, x, place, value_size(declared.types[n])), d))
     measured = declared.measured
     known.append(Dual(_loaded(code, z, INTEGER(0), value_size(measured)), [NO_SLOPE] * tangent_size(measured)))
 
@@ -61,38 +68,58 @@ def residual_code(declared: Declaration) -> str:
         known.append(_carry_out(node, [declared.types[k] for k in node.of], of))
 
     # 3. The residual, and whether it is one.
-    residual, within = known[-1], ir.IntType(1)(1)
-    for a, number in enumerate(residual.v):
-        value = _value(number, DOUBLE)
-        at_entry.store(value, at_entry.gep(out, [INTEGER(a)]))
+    residual, within = [_value(number, DOUBLE) for number in known[-1].v], ir.IntType(1)(1)
+    for value in residual:
         within = at_entry.and_(within, _is_within(code, at_entry, value, DOUBLE))
-    at_entry.cbranch(at_entry.icmp_signed("!=", slopes, INTEGER(0)), loop, end)
+    error = ErrorCode(at_entry, sizes, len(residual), was, information, delta, out)
+    pulling = [at_entry.select(within, value, DOUBLE(0.0)) for value in residual]
+    at_entry.cbranch(_is(at_entry, asked, SQUARE), blocks["square"], blocks["residual"])
+    square, written = at_block["square"], at_block["residual"]
+    found = square.select(within, error.square(square, residual), DOUBLE(-math.inf))
+    square.ret(square.bitcast(found, INTEGER))
+    for a, value in enumerate(residual):
+        written.store(value, written.gep(out, [INTEGER(a)]))
+    written.cbranch(_is(written, asked, ERROR), blocks["begin_error"], blocks["slopes"])
+    error.begin(at_block["begin_error"], var, rows, pulling)
+    at_block["begin_error"].branch(blocks["slopes"])
 
-    # 4. The Jacobian, from the last block of scalars on.
+    # 4. The Jacobian, from the last block of scalars on: stored, or held against what it was.
     now: Any = all_within
-    column = in_loop.mul(block, INTEGER(LANES))
-    dim = len(residual.v)
-    for a, slope in enumerate(residual.d):
-        value = _value(slope, WIDE)
-        here = in_loop.gep(out, [in_loop.add(column, INTEGER(dim + a * declared.scalars))])
-        in_loop.store(value, in_loop.bitcast(here, WIDE.as_pointer()), align=8)
-        now = in_loop.and_(now, _is_within(code, in_loop, value, WIDE))
-    following = in_loop.sub(block, INTEGER(1))
-    block.add_incoming(INTEGER(blocks - 1), entry)
-    block.add_incoming(following, loop)
-    all_within.add_incoming(ir.Constant(_BITS, [1] * LANES), entry)
-    all_within.add_incoming(now, loop)
-    lanes = in_loop.bitcast(now, ir.IntType(LANES))
-    also = in_loop.icmp_unsigned("==", lanes, ir.Constant(ir.IntType(LANES), (1 << LANES) - 1))
-    in_loop.cbranch(in_loop.icmp_signed(">=", following, INTEGER(0)), loop, end)
+    slopes = [_value(slope, WIDE) for slope in known[-1].d]
+    for slope in slopes:
+        now = in_loop.and_(now, _is_within(code, in_loop, slope, WIDE))
+    in_loop.cbranch(_is(in_loop, asked, ERROR), blocks["add_error"], blocks["store"])
+    store = at_block["store"]
+    column = store.mul(block, INTEGER(LANES))
+    for a, slope in enumerate(slopes):
+        here = store.gep(out, [store.add(column, INTEGER(len(residual) + a * declared.scalars))])
+        store.store(slope, store.bitcast(here, WIDE.as_pointer()), align=8)
+    store.branch(blocks["next"])
+    error.add(at_block["add_error"], block, slopes)
+    at_block["add_error"].branch(blocks["next"])
+    following = at_next.sub(block, INTEGER(1))
+    for before in ("residual", "begin_error"):
+        block.add_incoming(last, at_block[before].block)
+        all_within.add_incoming(ir.Constant(_BITS, [1] * LANES), at_block[before].block)
+    block.add_incoming(following, blocks["next"])
+    all_within.add_incoming(now, blocks["next"])
+    at_next.cbranch(at_next.icmp_signed(">=", following, INTEGER(0)), blocks["slopes"], blocks["all"])
 
     # 5. Which of both are numbers.
-    slopes_within = at_end.phi(ir.IntType(1))
-    slopes_within.add_incoming(ir.IntType(1)(0), entry)
-    slopes_within.add_incoming(also, loop)
-    found = at_end.select(slopes_within, INTEGER(BOTH), INTEGER(RESIDUAL))
-    at_end.ret(at_end.select(within, found, INTEGER(NO_NUMBER)))
+    at_all, at_end = at_block["all"], at_block["end"]
+    lanes = at_all.bitcast(now, ir.IntType(LANES))
+    also = at_all.icmp_unsigned("==", lanes, ir.Constant(ir.IntType(LANES), (1 << LANES) - 1))
+    at_all.cbranch(_is(at_all, asked, ERROR), blocks["end_error"], blocks["end"])
+    finish = at_block["end_error"]
+    error.end(finish, pulling, finish.and_(within, also))
+    finish.branch(blocks["end"])
+    number = at_end.select(also, INTEGER(BOTH), INTEGER(RESIDUAL))
+    at_end.ret(at_end.select(within, number, INTEGER(NO_NUMBER)))
     return str(module)
+
+
+def _is(builder: Any, asked: Any, what: int) -> Any:
+    return builder.icmp_signed("==", asked, INTEGER(what))
 
 
 def _loaded(code: Code, first: Any, place: Any, count: int) -> list[Operand]:

@@ -78,14 +78,18 @@ if DISABLED:
     def _first_of(array: Any, k: int) -> int:
         return int(array.ctypes.data) + 8 * k
 
-    def _call(address: int, *arguments: int) -> int:
-        return int(ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_int64] * len(arguments))(address)(*arguments))
+    def _call(address: int, words: tuple[int, ...]) -> int:
+        return int(ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_int64] * len(words))(address)(*words))
 
     def _word(k: int) -> int:
         return int(_TABLE.ravel()[k])
 
+    def _as_number(bits: int) -> float:
+        return float(np.int64(bits).view(np.float64))
+
     first_of: Any = _first_of
     call: Any = _call
+    as_number: Any = _as_number
     word: Any = _word
 
 else:
@@ -102,15 +106,24 @@ else:
         return types.int64(array, types.int64), emit
 
     @intrinsic
-    def call(_typing: Any, _address: Any, _a: Any, _b: Any, _c: Any, _d: Any, _e: Any, _f: Any) -> Any:
-        """The function at an address, called with six integers."""
+    def call(_typing: Any, _address: Any, words: Any) -> Any:
+        """The function at an address, called with a tuple of integers."""
 
         def emit(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-            address, *words = args
-            kind = ir.FunctionType(_WORD, [_WORD] * len(words))
-            return builder.call(builder.inttoptr(address, kind.as_pointer()), words)
+            kind = ir.FunctionType(_WORD, [_WORD] * words.count)
+            given = [builder.extract_value(args[1], k) for k in range(words.count)]
+            return builder.call(builder.inttoptr(args[0], kind.as_pointer()), given)
 
-        return types.int64(*[types.int64] * 7), emit
+        return types.int64(types.int64, words), emit
+
+    @intrinsic
+    def as_number(_typing: Any, _bits: Any) -> Any:
+        """The number that has these bits."""
+
+        def emit(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            return builder.bitcast(args[0], ir.DoubleType())
+
+        return types.float64(types.int64), emit
 
     @intrinsic
     def word(_typing: Any, _k: Any) -> Any:

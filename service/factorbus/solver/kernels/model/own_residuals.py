@@ -23,6 +23,6 @@ def find_without_residual(first: int, graph_table: I64) -> int:
         for n in range(count_ends(f, fac)):
             columns += dim_of(var[end_of(f, n, fac), at.V_KIND])
         out = np.empty(residual_size(f, fac) * (columns + 1) + BEHIND)
-        if evaluate_own(True, f, var, fac, graph.values, graph.payload, first_of(out, 0)) != BOTH:
+        if evaluate_own(f, var, fac, graph.values, graph.payload, first_of(out, 0)) != BOTH:
             return f
     return -1
