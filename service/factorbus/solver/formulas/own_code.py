@@ -9,7 +9,7 @@ import numpy as np
 from factorbus.proto.expressions.declaration import Declaration
 from factorbus.proto.expressions.formula import read_formula, write_formula
 from factorbus.proto.expressions.frames import moving_ends
-from factorbus.proto.expressions.operations import SE3, SO3, value_size
+from factorbus.proto.expressions.operations import SE2, SE3, SO3, value_size
 from factorbus.solver import errors
 from factorbus.solver.formulas.residual import NAME, residual_code
 from factorbus.solver.kernels.jit.compile import F64
@@ -18,6 +18,8 @@ from factorbus.solver.kernels.model import expression_layout as at
 
 # Whose graphs are gone are kept for a while: what a graph was copied from may still be read.
 _KEPT = 256
+# A pose, whose turn says how far a linear model of what it sees holds, (9.21), and what it sees.
+_SEEN = ((SE2, SE2), (SE2, "point2"), (SE3, SE3), (SE3, "point3"))
 _LESS = "drop a map that has others, or use another service"
 
 
@@ -46,9 +48,15 @@ def own_head(declared: Declaration) -> F64:
     head[at.X_BEFORE] = at.X_WIDTH + value_size(declared.measured)
     head[at.X_NUMBER] = number_of(declared)
     head[at.X_QUATERNION] = {SO3: 0, SE3: 3}.get(str(declared.measured), -1)
-    head[at.X_RIGID] = len(declared.variables) == 2 and moving_ends(declared) == (0, 1)
+    head[at.X_RIGID] = _is_rigid(declared)
     head.flags.writeable = False
     return head
+
+
+def _is_rigid(declared: Declaration) -> bool:
+    """Whether it is of a pose and of what that sees, and does not notice where in the world both are."""
+    kinds = [kind for _, kind in declared.variables]
+    return len(kinds) == 2 and (kinds[0], kinds[1]) in _SEEN and moving_ends(declared) == (0, 1)
 
 
 def own_code_of(formula: str) -> OwnCode:

@@ -6,6 +6,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.chord_step import error_left
 from factorbus.solver.kernels.bayes_tree.decrement import decrement
 from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_errors
+from factorbus.solver.kernels.bayes_tree.own_error import is_own_pose
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
@@ -78,7 +79,7 @@ def computed_error(graph: Graph, tree: Tree) -> float:
     total = 0.0
     for f in range(tree.state[tl.S_FACTORS]):
         if tree.link[f, tl.L_KIND] >= tl.EXACT or graph.fac[f, at.F_J] < 0:
-            total += tree.factor_errors[f, tl.E_ERROR]
+            total += 0.0 if is_own_pose(f, graph.var, graph.fac) else tree.factor_errors[f, tl.E_ERROR]
     return total
 
 

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import Panel, six
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.factor_rows import is_member, is_one_of_many, loss_code
-from factorbus.solver.kernels.model.kinds import is_camera
+from factorbus.solver.kernels.model.kinds import is_bounded, is_camera, is_rigid
 from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, multiply
 from factorbus.solver.kernels.model.many import linearize_kept, square_of, width_of
 from factorbus.solver.kernels.model.records import Graph
@@ -218,6 +218,23 @@ def _gradient(dr: int, d: int, WA: F64, r: F64, h: int, out: F64) -> int:
     return h + d
 
 
+@inline_kernel
+def lever_of_seen(f: int, graph: Graph, tree: Tree) -> tuple[float, float]:
+    """d and √ω of factor f, by which a pose sees another one or a point and whose error is computed: how far apart they
+    are, and what a shift of the other one weighs in its Hessian.  Where both turn as a whole its model misses up to
+    √ω ½ d φ², as in (9.4).
+    """
+    var, fac, x = graph.var, graph.fac, tree.lin[0]
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
+    di, dj = dim_of(var[i, at.V_KIND]), dim_of(var[j, at.V_KIND])
+    h, square, weight = tree.link[f, tl.L_AT] + di * di + di * dj, 0.0, 0.0
+    for a in range(2 if var[i, at.V_KIND] == at.SE2 else 3):
+        gap = x[var[j, at.V_AT] + a] - x[var[i, at.V_AT] + a]
+        square += gap * gap
+        weight += tree.hessian[h + a * dj + a]
+    return math.sqrt(square), math.sqrt(weight)
+
+
 @part
 def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     """Add a factor that was just linearized to what measures δ: the diagonal sums, and terms of its error.
@@ -234,10 +251,13 @@ def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     if s >= 0:
         for a in range(di):
             scalars[1, s + a] += hessian[h + a * di + a]
-    distance = root = 0.0
-    if not is_one_of_many(f, fac):  # of such a one the error is computed, (9.11)
+    if not is_one_of_many(f, fac) and (is_bounded(kind) or is_camera(kind)):
         distance = lever_of(kind, payload, fac[f, at.F_AT])
         root = root_weight(kind, scratch.W, distance)
+    elif is_rigid(kind) or fac[f, at.F_FLAGS] & at.RIGID != 0:
+        distance, root = lever_of_seen(f, graph, tree)
+    else:  # it says where in the world they are, so they are in nothing that moves as a whole
+        distance = root = 0.0
     turns[i, tl.U_LEVER] = max(turns[i, tl.U_LEVER], distance * root)
     if j >= 0:
         s = var[j, at.V_SCALAR]

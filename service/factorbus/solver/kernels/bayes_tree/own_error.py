@@ -8,7 +8,7 @@ import math
 
 from factorbus.solver.kernels.bayes_tree.hessian_room import jacobian_at
 from factorbus.solver.kernels.bayes_tree.records import Tree
-from factorbus.solver.kernels.jit.compile import part
+from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 from factorbus.solver.kernels.jit.scratch import free_since, scratch_used, take_floats
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import INACTIVE_CHI2
@@ -28,6 +28,21 @@ from factorbus.solver.kernels.model.expressions import (
 from factorbus.solver.kernels.model.factor_rows import loss_code, residual_size
 from factorbus.solver.kernels.model.losses import loss_of
 from factorbus.solver.kernels.model.records import Graph
+from factorbus.solver.kernels.model.sizes import dim_of
+
+
+@inline_kernel
+def is_own_pose(f: int, var: I64, fac: I64) -> bool:
+    """Whether factor f is an own kind, without a loss, that measures all of where one pose is from another.
+
+    Where the map turns, the forces of such factors turn with it, as those of the solver's own kinds that do: they are
+    not added up, (9.39).
+    """
+    flags, i, j = fac[f, at.F_FLAGS], fac[f, at.F_I], fac[f, at.F_J]
+    if flags & at.RIGID == 0 or loss_code(f, fac) != at.NO_LOSS or var[i, at.V_KIND] != var[j, at.V_KIND]:
+        return False
+    kind = var[i, at.V_KIND]
+    return (kind == at.SE2 or kind == at.SE3) and residual_size(f, fac) >= dim_of(kind)
 
 
 @part

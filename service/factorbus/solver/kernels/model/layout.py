@@ -27,7 +27,7 @@ F_WIDTH = 8
 
 # Bits of F_FLAGS.
 SWAPPED = 1  # the block of the pair stands as (j, i), because column j comes first
-RIGID = 2  # of an own kind: its residual stays as its two variables move as one body
+RIGID = 2  # of an own kind: of a pose and what it sees, and its residual stays as both move as one body
 MOUNTED = 4  # of an inertial factor: the mount is a variable, the first behind the six that all of them have
 LOSS_SHIFT, LOSS_MASK = 8, 0xFF  # the code of its loss
 OFFSET_SHIFT, OFFSET_MASK = 16, 0xFFFF  # of a member: how many rows before it the factor begins
