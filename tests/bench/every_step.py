@@ -2,8 +2,9 @@
 
     python tests/bench/every_step.py [--only NAME,...] [--seeds N | --seed S,...] [--no-isam2] [--json [FILE]] [...]
 
-    simulated  manhattan, city_trees, sphere, bearing_range: drives of 1,000 poses, drawn anew in each run
-    data       intel, killian_freiburg, manhattan3500, victoria_park, parking_garage, sphere2500
+    simulated  manhattan, city_trees, sphere, bearing_range: drives of 1,000 poses, drawn anew in each run; the first
+               three also as kinds that a client has written as formulas (own_manhattan, ...)
+    data       intel, killian_freiburg, manhattan3500, victoria_park, parking_garage, sphere2500; own_parking_garage
     hard       steps that turn much of a map: loops closed after a drift of 60° to 180° (drift), two robots that meet at
                any angle (meetings_2d, _3d), positions that come late (late_2d, _3d), ranges to fixed points that do
                (ranges_2d, _3d), GNSS in a frame that is estimated (frames_2d, _3d), wrong loop closures under Huber's
@@ -43,6 +44,7 @@ from bench.every.follow import follow
 from bench.every.rows import far_steps, row_of, together
 from bench.every.verdicts import judge
 from bench.replays.command import folder_named, natural, positive
+from bench.replays.own_kinds import in_usual_kinds
 from bench.replays.targets import missed
 
 from factorbus.solver import Options, SolverError, warm
@@ -107,7 +109,7 @@ def measure(drive: Drive) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if drive.isam2:
         from bench.every.peer import follow_isam2  # here, so that without it GTSAM need not be installed
 
-        isam2 = follow_isam2(steps, drive.every)
+        isam2 = follow_isam2([in_usual_kinds(step) for step in steps], drive.every)
     row = row_of(drive.world, drive.seed, len(steps), found, isam2)
     return row, far_steps(drive.world, drive.seed, found)
 

@@ -28,10 +28,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bench.replays.compose import first_values
 from bench.replays.gtsam_factors import gtsam_factors, held, pose3
+from bench.replays.own_kinds import in_own_kinds, with_values
 from bench.replays.problems import ALL, Problem, choose, load
-from naive.own_formulas import OWN
 
 from factorbus.proto.messages import Batch, Factors
 from factorbus.service.process.worker_threads import core_count
@@ -80,28 +79,6 @@ def main() -> int:
     }
     print(json.dumps(result, indent=1) if told.json else _text(result))
     return 0 if result["own_over_built_in"] <= _MOST_SHARE and first <= _MOST_FIRST_S else 1
-
-
-def with_values(batches: Sequence[Batch]) -> list[Batch]:
-    """The same, new poses composed from the estimate of a replay: an own kind gives no value to a variable."""
-    solver, made, values = Solver(Options()), [], dict[int, np.ndarray]()
-    for batch in batches:
-        found = first_values(batch, lambda _kind, key: values[key])
-        variables = tuple(
-            group._replace(values=np.array([found[key][1] for key in group.keys.tolist()])) for group in batch.variables
-        )
-        made.append(batch._replace(variables=variables))
-        solver.stage(made[-1])
-        solver.step()
-        for group in solver.estimate():
-            values.update(zip(group.keys.tolist(), group.values, strict=True))
-    return made
-
-
-def in_own_kinds(batch: Batch) -> Batch:
-    """The same with formulas in place of the solver's kinds."""
-    factors = [group._replace(kind=OWN[group.kind].name) if group.kind in OWN else group for group in batch.factors]
-    return batch._replace(factors=tuple(factors))
 
 
 def first_own(batches: Sequence[Batch]) -> float:

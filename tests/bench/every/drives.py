@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from bench.replays.own_kinds import in_own_kinds, with_values
 from bench.replays.problems import Problem, load
 
 from factorbus.datasets import CATALOGUE, Places, dataset_named, locate
@@ -23,12 +24,14 @@ class World:
     """A name, what makes its steps, and how many poses it has; 0: all that there are.
 
     kind: "simulated" and "data" are ordinary drives, for which there are more targets; "hard" are not.
+    data: the data set that it is made of
     """
 
     name: str
     make: Make
     poses: int = 1000
     kind: str = "simulated"
+    data: str = ""
 
     @property
     def is_drawn(self) -> bool:
@@ -49,6 +52,11 @@ def _data(name: str, poses: int, _seed: int) -> Iterable[Batch]:
     return load(Problem(name, name, poses))
 
 
+def _own(make: Make, poses: int, seed: int) -> Iterator[Batch]:
+    """The same measurements as kinds that a client has written as formulas."""
+    return map(in_own_kinds, with_values(make(poses, seed)))
+
+
 KINDS = ("simulated", "data", "hard")
 WORLDS = {
     world.name: world
@@ -57,6 +65,9 @@ WORLDS = {
         World("city_trees", partial(_simulated, "city_trees")),
         World("sphere", partial(_simulated, "sphere")),
         World("bearing_range", partial(_simulated, "city_trees", sensor=TreeSensor("bearing_range_se2"))),
+        World("own_manhattan", partial(_own, partial(_simulated, "manhattan"))),
+        World("own_city_trees", partial(_own, partial(_simulated, "city_trees"))),
+        World("own_sphere", partial(_own, partial(_simulated, "sphere"))),
         World("outliers", hard.outliers, kind="hard"),
         World("drift", hard.drift, kind="hard"),
         World("meetings_2d", partial(hard.meetings, PLANE), 400, "hard"),
@@ -68,9 +79,10 @@ WORLDS = {
         World("frames_2d", partial(late.late_frames, PLANE), 300, "hard"),
         World("frames_3d", partial(late.late_frames, SPACE), 300, "hard"),
         *(
-            World(name, partial(_data, name), 0, "data")
+            World(name, partial(_data, name), 0, "data", name)
             for name in ("intel", "killian_freiburg", "manhattan3500", "victoria_park", "parking_garage", "sphere2500")
         ),
+        World("own_parking_garage", partial(_own, partial(_data, "parking_garage")), 0, "data", "parking_garage"),
     )
 }
 
@@ -84,4 +96,4 @@ def chosen(words: list[str]) -> list[World]:
 
 def is_here(world: World) -> bool:
     """Whether the data set of a world is on this machine."""
-    return world.is_drawn or locate(dataset_named(world.name, CATALOGUE), Places.of_this_machine()) is not None
+    return world.is_drawn or locate(dataset_named(world.data, CATALOGUE), Places.of_this_machine()) is not None

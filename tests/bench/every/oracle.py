@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from bench.replays.chi2 import RESIDUALS
 from bench.replays.columns import F64, I64, symmetric
+from bench.replays.own_kinds import USUAL
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
@@ -162,7 +163,7 @@ class _Problem:
         return self._at(f, [x[kind][index] for kind, index in ends])
 
     def _at(self, f: _Factors, values: list[F64]) -> F64:
-        r = RESIDUALS[f.kind](values[0], values[-1], f.z)
+        r = RESIDUALS[USUAL.get(f.kind, f.kind)](values[0], values[-1], f.z)
         return np.einsum("mij,mj->mi", f.roots, r)
 
     def _jacobian(self, f: _Factors, ends: list[tuple[str, I64]], n: int, x: dict[str, F64]) -> F64:
