@@ -16,6 +16,7 @@ import numpy as np
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.changes.requested import Edits
 from factorbus.solver.graph.factor_graph import FactorGraph
+from factorbus.solver.graph.factor_ids import Ids
 from factorbus.solver.graph.factor_rows import is_first, losses_of, rows_of_arities, with_losses
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -50,8 +51,7 @@ class _Before:
     levers: F64
     hessians: list[F64]
     weighed: list[F64]
-    ids: I64
-    id_shift: int
+    ids: Ids
     holes: int
 
 
@@ -94,12 +94,10 @@ class FactorEdit:
         linked = int(edit_factors(self.gone, self.renewed, graph.array_table, tree.array_table, self._log))
         self._linked = linked if linked >= 0 else -1 - linked
         if self.gone.size:
-            last = max(graph.ids.size, int(self.gone[-1]) + 1)
-            ids = np.delete(graph.ids_of(np.arange(last)), self.gone)
+            graph.drop_ids(self.gone)
             graph.holes += int(self._widths(self.gone).sum())
             close_gaps(self.gone, graph.array_table, tree.array_table)
             graph.counts[at.MEMBERS] -= self.members
-            graph.ids, graph.id_shift = ids, graph.id_shift + self.gone.size
             self._closed = True
         return linked >= 0
 
@@ -111,8 +109,9 @@ class FactorEdit:
         if self._closed:
             open_gaps(self.gone, graph.array_table, tree.array_table)
             graph.counts[at.MEMBERS] += self.members
-        graph.ids, graph.id_shift, graph.holes = before.ids, before.id_shift, before.holes
+        graph.put_ids(before.ids)
         graph.forget_ids()
+        graph.holes = before.holes
         graph.fac[self._rows] = before.fac
         for row, numbers in zip(self.renewed.tolist(), before.weighed, strict=True):
             start = graph.fac[row, at.F_AT]
@@ -170,8 +169,7 @@ class FactorEdit:
             tree.turns[ends, tl.U_LEVER],
             hessians,
             weighed,
-            graph.ids,
-            graph.id_shift,
+            graph.kept_ids(),
             graph.holes,
         )
 

@@ -3,10 +3,6 @@
 
 A `Mark` is how much of everything was in use at some moment; `forget` goes back to it.  Nothing that was there then
 has been moved, so going back is setting counts and clearing the keys that came after.
-
-A factor's id is the number of factors that the map took in before it, and stays with it when others are removed: the
-ids of the first rows are listed, those of the rows behind them follow each other without gaps.  A closure that is put
-back has the last row, and the id it had.
 """
 
 from typing import Any, TypeAlias
@@ -16,7 +12,8 @@ import numpy as np
 from factorbus.proto import inertial
 from factorbus.solver.errors import printed
 from factorbus.solver.formulas.own_code import own_code_of
-from factorbus.solver.graph.arenas import Arenas, lines, roomy, slots_of, with_room
+from factorbus.solver.graph.arenas import lines, slots_of, with_room
+from factorbus.solver.graph.factor_ids import FactorIds
 from factorbus.solver.graph.factor_rows import (
     arities_of,
     ends_of_rows,
@@ -57,7 +54,7 @@ _NO_KEYS: I64 = np.empty(0, np.int64)
 _new = tuple.__new__
 
 
-class FactorGraph(Arenas):
+class FactorGraph(FactorIds):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = records.Graph._fields
@@ -65,6 +62,7 @@ class FactorGraph(Arenas):
     NOT_KEPT = ("_rows", "_id_room", "_unlisted", "array_table", "own_before", "own_code")
 
     def __init__(self) -> None:
+        super().__init__()
         # Room for the first few hundred factors: the step that finds none takes several times as long.
         self.keys: I64 = np.empty(256, np.int64)
         self.var: I64 = lines((256, at.V_WIDTH), np.int64)
@@ -77,10 +75,6 @@ class FactorGraph(Arenas):
         self.table: I64 = np.zeros(slots_of(0), np.int64)
         # No keys yet: it loads the kernel, which the step that needs a larger table would have to wait for.
         enter_keys(0, self.table, self.keys)
-        self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`
-        self.id_shift = 0  # of a later row: its id less its number
-        self._id_room: I64 = np.empty(0, np.int64)  # where ids are listed that grow with every insert
-        self._unlisted: tuple[I64, int] | None = None  # both as they were before factors had several rows
         self.holes = 0  # numbers of the payload that no factor has any more
         self.own: tuple[str, ...] = ()  # the own kinds of its factors: their formulas, each once
         # Where kinds came since the last step: how many rows of factors there were, and the kinds.
@@ -190,11 +184,6 @@ class FactorGraph(Arenas):
         return stamps if (stamps != at.NO_STAMP).any() else None
 
     @property
-    def next_id(self) -> int:
-        """The id that the next factor gets."""
-        return int(self.counts[at.FACTORS]) + self.id_shift
-
-    @property
     def factor_count(self) -> int:
         """Factors; those of more than two variables have several rows."""
         return int(self.counts[at.FACTORS] - self.counts[at.MEMBERS])
@@ -206,58 +195,6 @@ class FactorGraph(Arenas):
             return min(factors, len(fac))
         starts = np.flatnonzero(is_first(fac))
         return int(starts[factors]) if factors < starts.size else len(fac)
-
-    def name_rows(self, first: int, first_id: int) -> None:
-        """Give their ids to the rows from `first` on, which came last; the first of them gets `first_id`.
-
-        For a graph of which a factor has several rows: then all ids are listed, since those rows have the same.
-        """
-        rows = int(self.counts[at.FACTORS])
-        ids = first_id - 1 + np.cumsum(is_first(self.fac[first:rows]))
-        if self._unlisted is None and self.ids.size < first:
-            self._unlisted = self.ids, self.id_shift
-        if self.ids.base is not self._id_room or self.ids.size != first or rows > self._id_room.size:
-            before = self.ids_of(np.arange(first))
-            self._id_room = np.empty(roomy(rows, first), np.int64)
-            self._id_room[:first] = before
-        self._id_room[first:rows] = ids
-        self.name_factors(self._id_room[:rows], int(ids[-1]) + 1 if ids.size else first_id)
-
-    def forget_ids(self) -> None:
-        """Of rows that are gone, which came last."""
-        rows = int(self.counts[at.FACTORS])
-        if self._unlisted is not None and not self.counts[at.MEMBERS]:
-            (self.ids, self.id_shift), self._unlisted = self._unlisted, None
-        if self.ids.size > rows:
-            self.name_factors(self.ids[:rows], int(self.ids[rows]))
-
-    def name_factors(self, ids: I64, following: int) -> None:
-        """The factors that are there have these ids; the next one gets `following`."""
-        self.ids, self.id_shift = ids, following - ids.size
-
-    def rename_last(self, ids: I64, following: int) -> None:
-        """The factors in the last rows have these ids; the next one gets `following`."""
-        first = int(self.counts[at.FACTORS]) - ids.size
-        self.name_factors(np.concatenate([self.ids_of(np.arange(first)), ids]), following)
-        self._unlisted = None
-
-    def ids_of(self, rows: I64) -> I64:
-        """The ids of the factors in these rows of `fac`."""
-        named = self.ids.size
-        if not named:
-            return rows + self.id_shift
-        return np.where(rows < named, self.ids[np.minimum(rows, named - 1)], rows + self.id_shift)
-
-    def rows_of(self, ids: I64) -> I64:
-        """The rows of the factors with these ids; −1 where there is none."""
-        named, count = self.ids.size, int(self.counts[at.FACTORS])
-        later = ids - self.id_shift
-        found = np.where((later >= named) & (later < count), later, -1)
-        if named:
-            order = np.argsort(self.ids, kind="stable")
-            place = order[np.minimum(np.searchsorted(self.ids, ids, sorter=order), named - 1)]
-            found = np.where(self.ids[place] == ids, place, found)
-        return found
 
     def find(self, key: int) -> int:
         """Index of the variable `key`, or −1."""
