@@ -13,7 +13,7 @@ from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS as SIMULATED
 from factorbus.simulate import TreeSensor
 
-from . import hard, late
+from . import far, hard, late
 from .motion import PLANE, SPACE
 
 Make = Callable[[int, int], Iterable[Batch]]  # poses (0: all), seed
@@ -78,6 +78,9 @@ WORLDS = {
         World("ranges_3d", partial(late.late_ranges, SPACE), 300, "hard"),
         World("frames_2d", partial(late.late_frames, PLANE), 300, "hard"),
         World("frames_3d", partial(late.late_frames, SPACE), 300, "hard"),
+        World("far_2d", partial(far.far_landmarks, PLANE), 200, "hard"),
+        World("far_3d", partial(far.far_landmarks, SPACE), 200, "hard"),
+        World("own_far_2d", partial(_own, partial(far.far_landmarks, PLANE)), 200, "hard"),
         *(
             World(name, partial(_data, name), 0, "data", name)
             for name in ("intel", "killian_freiburg", "manhattan3500", "victoria_park", "parking_garage", "sphere2500")

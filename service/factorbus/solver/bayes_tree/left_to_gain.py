@@ -53,5 +53,6 @@ def judge_batch(tree: CliqueTree, result: Minimization, share: float, last: floa
     elif result.converged and chi2 < (1.0 - _ROUNDING) * result.chi2:
         # Beside a saddle point a step that gains nothing leads to where much is left.
         result.converged = not is_left(tree, share)
+    tree.state[tl.S_SLOW] = 0 if result.converged else 1
     if is_last or not result.converged:
         totals[tl.T_LEAST] = chi2 if result.converged else 0.0

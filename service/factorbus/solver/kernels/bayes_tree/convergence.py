@@ -4,7 +4,7 @@ import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.chord_step import error_left
-from factorbus.solver.kernels.bayes_tree.decrement import decrement
+from factorbus.solver.kernels.bayes_tree.decrement import HARDLY_LESS, decrement
 from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_errors
 from factorbus.solver.kernels.bayes_tree.own_error import is_own_pose
 from factorbus.solver.kernels.bayes_tree.records import Tree
@@ -21,7 +21,8 @@ AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
 MOST_LEFT = 0.5  # of the Σ error² that is allowed: what a chord step may leave, as it counts as a round
 SLOW = 0.1  # times as much error² is allowed after a step that had not converged
 UNCHECKED = 0.02  # of `converged_share` χ²: where factors whose error is computed have more, the decrement is, too,
-CHANGED = 0.5  # unless less than this share of the Σ error² of the last time has changed, all in all
+CHANGED = 0.2  # unless less than this share of the Σ error² of the last time has changed, all in all
+SEEN = 1e-6  # of χ²: rounds that gain hardly less than those before, and no more than this, are no reason to go on
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -49,26 +50,32 @@ def left(totals: F64) -> float:
     return totals[tl.T_ERROR] + totals[tl.T_EXCESS]
 
 
+@inline_kernel
+def is_slow(fell: float, fell_before: float, state: I64, totals: F64) -> bool:
+    """Whether the step before had not converged, or rounds gain hardly less than the ones before.
+
+    fell, fell_before: by how much the last round lowered χ², and the one before, if neither was the first
+    """
+    follows = fell > HARDLY_LESS * fell_before > 0.0 and fell > SEEN * (totals[tl.T_CHI2] + LEAST_CHI2)
+    return state[tl.S_SLOW] != 0 or follows
+
+
 @part
-def check_decrement(graph: Graph, tree: Tree, settings: F64) -> None:
-    """Compute the decrement where Σ error² is as small as is allowed, and factors whose error is computed, not bounded,
-    have a part in it that has changed.
+def check_decrement(slow: bool, graph: Graph, tree: Tree, settings: F64) -> None:
+    """Compute the decrement where Σ error² is as small as is allowed: where factors whose error is computed, not
+    bounded, have a part in it that has changed; or it is `slow`.
     """
     state, totals = tree.state, tree.totals
     error, share = totals[tl.T_ERROR], settings[tl.P_CONVERGED] * (totals[tl.T_CHI2] + LEAST_CHI2)
     least = UNCHECKED * share
-    if (
-        state[tl.S_CONTINUES] != 0
-        or state[tl.S_EXACT] == 0
-        or error <= least
-        or error > allowed(settings, state, totals)
-    ):
+    is_nothing = state[tl.S_EXACT] == 0 or error <= least
+    if state[tl.S_CONTINUES] != 0 or error > allowed(settings, state, totals) or (is_nothing and not slow):
         totals[tl.T_EXCESS] = 0.0
-    elif totals[tl.T_UNCHECKED] > max(least, CHANGED * totals[tl.T_CHECKED]):
+    elif slow or totals[tl.T_UNCHECKED] > max(least, CHANGED * totals[tl.T_CHECKED]):
         totals[tl.T_UNCHECKED], totals[tl.T_CHECKED], totals[tl.T_EXCESS] = 0.0, error, 0.0
-        if computed_error(graph, tree) > least:
+        if slow or computed_error(graph, tree) > least:
             most = slowly_left(settings, state) * (totals[tl.T_CHI2] + LEAST_CHI2)
-            found = decrement(least_error(settings, state, totals), most, graph, tree)
+            found = decrement(least_of_sum(settings, state, totals), most, graph, tree)
             totals[tl.T_EXCESS] = found - error if found > most else 0.0
 
 
@@ -89,7 +96,9 @@ def mark_unconverged(graph: Graph, tree: Tree, settings: F64) -> None:
     state, totals = tree.state, tree.totals
     if left(totals) > allowed(settings, state, totals):
         note_work(SCANNING * state[tl.S_FACTORS], totals)
-        mark_large_errors(least_error(settings, state, totals), graph, tree)
+        adds_up = totals[tl.T_EXCESS] > 0.0
+        least = least_of_sum(settings, state, totals) if adds_up else least_error(settings, state, totals)
+        mark_large_errors(least, graph, tree)
         state[tl.S_DUE] = 1
 
 
@@ -97,6 +106,12 @@ def mark_unconverged(graph: Graph, tree: Tree, settings: F64) -> None:
 def least_error(settings: F64, state: I64, totals: F64) -> float:
     """The error² of a factor from which on it has a part in Σ error²."""
     return PASSED_OVER * allowed(settings, state, totals) / state[tl.S_FACTORS]
+
+
+@inline_kernel
+def least_of_sum(settings: F64, state: I64, totals: F64) -> float:
+    """The same where forces may add up: n of them along one direction come to n² times the square of one."""
+    return least_error(settings, state, totals) / state[tl.S_FACTORS]
 
 
 @inline_kernel

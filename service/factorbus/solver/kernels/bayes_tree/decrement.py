@@ -9,6 +9,8 @@ and the step takes off more than that sum.  So where the sum is not nothing the 
 3  backwards   z = R⁻¹ d where that is too much, parents first, and along it what χ² loses: R may be old, and then that
                is less, or the step is elsewhere.  So 2 and 3 are repeated with the gradient that is left, each
                direction conjugate to those before: conjugate gradients, preconditioned by R
+4  try         the step, where what it takes off is not little: along a curved valley χ² falls by up to twice as much,
+               and further steps gain hardly less
 """
 
 import numpy as np
@@ -21,19 +23,25 @@ from factorbus.solver.kernels.bayes_tree.refactor_in_place import mark_above
 from factorbus.solver.kernels.bayes_tree.work import RELINEARIZING, SCANNING, note_work, work_of_solving
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.chi2 import sum_chi2
 from factorbus.solver.kernels.model.factor_rows import count_ends, end_of, is_member, is_one_of_many, row_of_pair
 from factorbus.solver.kernels.model.linearize import Scratch, make_scratch
 from factorbus.solver.kernels.model.multiply_hessian import add_product, add_product_of_many
 from factorbus.solver.kernels.model.records import Graph
+from factorbus.solver.kernels.model.retract import move
 
+TRIED = 0.02  # of what may be left: a step that is to take off more is tried
+HARDLY_LESS = 0.5  # of what the step before gained: one that gains more follows a valley
+AMPLE = 2.0  # times what steps that converge at one rate come to
 DIRECTIONS = 6  # at most: on old R the first are along what R, and not Λ, hardly holds
 
 
 @part
 def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
-    """|R⁻ᵀ g|² with g the gradient that the linear models of all factors with error² of more than `least` miss; where
+    """|R⁻ᵀ g|² with g the gradient that the linear models of factors miss, of error² above `least` or absolute; where
     that is more than `most`, what χ² loses by the best step in up to `DIRECTIONS` directions, by the Jacobians at the
-    estimate, or in as many as come to more than `most`.
+    estimate, or in as many as come to more than `most`.  Where that is within `most` and not little: what steps like
+    it take off one after the other.
     """
     var, fac, node, clique, state = graph.var, graph.fac, tree.node, tree.clique, tree.state
     g = np.zeros(graph.counts[at.SCALARS])
@@ -41,7 +49,7 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
     state[tl.S_STAMP] += 1
     # 1
     for f in range(state[tl.S_FACTORS]):
-        if tree.factor_errors[f, tl.E_ERROR] > least and not is_member(f, fac):
+        if has_part(f, least, graph, tree):
             taken += 1
             add_difference(graph, tree, f, scratch, tree.scalars[0], True, g)
             for n in range(count_ends(f, fac)):
@@ -57,9 +65,12 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
     z = g.copy()
     square = solve_forwards(graph, tree, cliques, z)
     if square <= most:
-        return square
+        if square <= TRIED * most:
+            return square
+        solve_backwards(graph, tree, cliques, z)
+        return left_along(z, square, graph, tree)
     # 3  p: the direction; Mp: RᵀR p; Ap: Λ p at the estimate
-    found, p, Mp = 0.0, np.zeros(g.size), np.zeros(g.size)
+    found, p, Mp, step = 0.0, np.zeros(g.size), np.zeros(g.size), np.zeros(g.size)
     factor = 0.0
     for _ in range(DIRECTIONS):
         solve_backwards(graph, tree, cliques, z)
@@ -68,7 +79,7 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
             p[s] = z[s] + factor * p[s]
             Mp[s] = g[s] + factor * Mp[s]
         for f in range(state[tl.S_FACTORS]):
-            if tree.factor_errors[f, tl.E_ERROR] > least and not is_member(f, fac):
+            if has_part(f, least, graph, tree):
                 add_difference(graph, tree, f, scratch, p, False, Ap)
         note_work(work, tree.totals)
         curvature = 0.0
@@ -79,13 +90,48 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
             return square
         found += square * (square / curvature)
         if found > most:
-            break
+            return found
         for s in range(g.size):
+            step[s] += square / curvature * p[s]
             g[s] -= square / curvature * Ap[s]
             z[s] = g[s]
         before, square = square, solve_forwards(graph, tree, cliques, z)
         factor = square / before
-    return found
+    return left_along(step, found, graph, tree) if found > TRIED * most else found
+
+
+@inline_kernel
+def has_part(f: int, least: float, graph: Graph, tree: Tree) -> bool:
+    """Whether the gradient of factor f is another one than that of its linear model: error² of more than `least`, or
+    the map has turned against what is fixed, and so does the force of what is exactly linear."""
+    if is_member(f, graph.fac):
+        return False
+    i, j = graph.fac[f, at.F_I], graph.fac[f, at.F_J]
+    if tree.factor_errors[f, tl.E_ERROR] > least or j < 0:
+        return True
+    return graph.var[i, at.V_SCALAR] < 0 or graph.var[j, at.V_SCALAR] < 0
+
+
+@part
+def left_along(step: F64, expected: float, graph: Graph, tree: Tree) -> float:
+    """What steps take off χ² of which the first, −`step`, is `expected` to take off so much.  (9.41)
+
+    χ² falls by (1 + r) times as much, r the rate at which Gauss-Newton steps converge along it: Λ leaves out what
+    curves χ² the other way.  So they come to 1 / (1 − r) times as much.  From `HARDLY_LESS` on nobody knows to how
+    much, for along a valley r is not the same for long; nor where χ² falls by so much less: what follows then goes
+    elsewhere, and may gain more.
+    """
+    variables, factors = tree.state[tl.S_VARIABLES], tree.state[tl.S_FACTORS]
+    for s in range(step.size):
+        step[s] = -step[s]
+    there = np.empty(graph.counts[at.VALUES])
+    move(variables, graph.var, graph.values, step, there)
+    chi2 = tree.totals[tl.T_CHI2]
+    note_work(RELINEARIZING * factors, tree.totals)
+    rate = (chi2 - sum_chi2(0, factors, graph.var, graph.fac, there, graph.payload)) / expected - 1.0
+    if not -HARDLY_LESS < rate < HARDLY_LESS:
+        return chi2
+    return min(AMPLE * expected / (1.0 - rate) if rate > 0.0 else expected, chi2)
 
 
 @part

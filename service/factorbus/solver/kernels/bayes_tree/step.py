@@ -28,6 +28,7 @@ from factorbus.solver.kernels.bayes_tree.convergence import (
     check_decrement,
     goes_on,
     is_clear,
+    is_slow,
     least_error,
     mark_unconverged,
     may_keep_factor,
@@ -90,6 +91,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         undo(graph, tree, v0)
         return tl.INFINITE
     put_off = False  # of what is due a part is left for later steps
+    fell, fell_before = 0.0, 0.0  # by how much the last round lowered χ², and the one before
     while True:
         moving = tree.pending[: count_due(state)]
         if moving.size > 0 and bounded:
@@ -123,6 +125,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
             weighted_error = follow_up(graph, tree, scaled)
         chi2 = totals[tl.T_CHI2]
         if state[tl.S_ROUNDS] > 1:
+            fell, fell_before = before - chi2, fell
             totals[tl.T_GAINED] = max(totals[tl.T_GAINED], before - chi2)
         totals[tl.T_GAINED] = max(totals[tl.T_GAINED], totals[tl.T_BEFORE] - chi2)
         if state[tl.S_BEHIND] != 0:  # χ² of what is torn says nothing
@@ -130,7 +133,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
             break
-        check_decrement(graph, tree, scaled)
+        check_decrement(is_slow(fell, fell_before, state, totals), graph, tree, scaled)
         if state[tl.S_WAIT] != 0 or not goes_on(weighted_error, scaled, state, totals):
             break
         if put_off or not may_go_on(tree, scaled[tl.P_BUDGET]):
@@ -140,7 +143,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
             began = cycles()
             if left != TOO_MUCH:
                 weighted_error, totals[tl.T_GAINED] = left, max(totals[tl.T_GAINED], chi2 - totals[tl.T_CHI2])
-                check_decrement(graph, tree, scaled)
+                check_decrement(state[tl.S_SLOW] != 0, graph, tree, scaled)
                 if totals[tl.T_CHI2] <= chi2 and not goes_on(weighted_error, scaled, state, totals):
                     break
         mark_unconverged(graph, tree, scaled)
