@@ -19,6 +19,7 @@ from bench.every.oracle import Oracle
 from bench.every.peer import Isam2Judge, Watched, follow_isam2
 from bench.every.rows import far_steps, row_of, together
 from bench.every.verdicts import judge
+from bench.replays.chi2 import RESIDUALS, into_frame_2d, into_frame_3d
 from bench.replays.contestants import Failed
 from bench.replays.gtsam_factors import gtsam_factors, pose3
 from bench.replays.isam2 import Isam2Settings
@@ -226,6 +227,34 @@ def test_isam2_s_priors_and_positions_are_ours_to_first_order(motion: Motion, ki
         (theirs,) = gtsam_factors(group)
         ours = judged.chi2([Group(motion.kind, np.array([key]), value[None])])
         assert 2 * theirs.error(values) == pytest.approx(ours, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["landmark_se2", "landmark_se3", "bearing_se2", "bearing_range_se2", "range_se2"])
+def test_isam2_s_sights_of_landmarks_are_ours_to_first_order(kind: str) -> None:
+    rng = np.random.default_rng(6)
+    space = kind.endswith("se3")
+    size, pose, place = (3, "se3", "point3") if space else (2, "se2", "point2")
+    value = (SPACE if space else PLANE).far(rng, 1.0, 2.0, 30.0, 60.0)
+    keys, values = (symbol("x", 0), symbol("l", 0)), gtsam.Values()
+    values.insert(keys[0], pose3(value) if space else gtsam.Pose2(*value))
+    for _ in range(5):
+        landmark = value[:size] + rng.uniform(2.0, 9.0, size)
+        near = landmark + 1e-4 * rng.normal(size=size)
+        u = into_frame_3d(value[None], near[None])[0] if space else into_frame_2d(value[None], near[None])[0]
+        angle, distance = float(np.arctan2(u[1], u[0])), float(np.linalg.norm(u))
+        seen = {"bearing": [angle], "bearing_range": [angle, distance], "range": [distance]}
+        z = np.array(seen.get(kind.removesuffix("_se2"), u))
+        group = factor(kind, list(keys), z, tuple(rng.uniform(0.05, 0.5, len(z))))
+        judged = Judge()
+        known = [Group(pose, np.array([keys[0]]), value[None]), Group(place, np.array([keys[1]]), landmark[None])]
+        judged.take_in(Batch(tuple(Variables(g.kind, g.keys, g.values) for g in known), (group,)))
+        if values.exists(keys[1]):
+            values.erase(keys[1])
+        values.insert(keys[1], gtsam.Point3(*landmark) if space else gtsam.Point2(*landmark))
+        (theirs,) = gtsam_factors(group)
+        ours = judged.chi2(known)
+        assert 2 * theirs.error(values) == pytest.approx(ours, rel=1e-3)
+        assert (RESIDUALS[kind](value[None], landmark[None], z[None]) ** 2).sum() > 0.0
 
 
 def test_isam2_s_positions_with_a_lever_are_refused() -> None:

@@ -60,11 +60,11 @@ def test_what_steps_take_off_follows_from_what_the_first_one_does(world: str, se
     step = np.linalg.solve(was, gradient)
     expected, there = float(gradient @ step), graph.values.copy()
     arrays = graph_at(graph.array_table), tree_at(tree.array_table)
-    assert decrement(-1.0, 100.0 * expected, *arrays) == pytest.approx(expected, rel=1e-6), "little: not tried"
+    assert decrement(-1.0, True, 100.0 * expected, *arrays) == pytest.approx(expected, rel=1e-6), "little: not tried"
     move(int(graph.counts[at.VARIABLES]), graph.var, graph.values, -step, there)
     factors = int(graph.counts[at.FACTORS])
     chi2 = float(tree.totals[tl.T_CHI2])
     rate = (chi2 - sum_chi2(0, factors, graph.var, graph.fac, there, graph.payload)) / expected - 1.0
     within = -HARDLY_LESS < rate < HARDLY_LESS
     wanted = expected * (AMPLE / (1.0 - rate) if rate > 0.0 else 1.0) if within else chi2
-    assert decrement(-1.0, 1.5 * expected, *arrays) == pytest.approx(min(wanted, chi2), rel=1e-6)
+    assert decrement(-1.0, True, 1.5 * expected, *arrays) == pytest.approx(min(wanted, chi2), rel=1e-6)

@@ -50,13 +50,13 @@ def test_it_is_that_of_dense_matrices(name: str) -> None:
     square = gradient @ step
     assert square > 1e-3
     arrays = graph_at(graph.array_table), tree_at(tree.array_table)
-    assert decrement(-1.0, np.inf, *arrays) == pytest.approx(square, rel=1e-6)
+    assert decrement(-1.0, False, np.inf, *arrays) == pytest.approx(square, rel=1e-6)
     gains = conjugate_gains(now, was, gradient, DIRECTIONS)
     assert gains[0] < gains[-1] <= gradient @ np.linalg.solve(now, gradient) * (1.0 + 1e-9)
     for k, (before, gain) in enumerate(pairwise([0.0, *(gain * (1.0 + 1e-9) for gain in gains)])):
         if before < square:
             of_rounding = 1e-6 if k < 2 else 1e-2  # directions lose what makes them conjugate
-            assert decrement(-1.0, before, *arrays) == pytest.approx(gain, rel=of_rounding)
+            assert decrement(-1.0, False, before, *arrays) == pytest.approx(gain, rel=of_rounding)
 
 
 def conjugate_gains(now: np.ndarray, was: np.ndarray, gradient: np.ndarray, most: int) -> list[float]:

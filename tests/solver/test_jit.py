@@ -292,6 +292,17 @@ def test_old_folders_go_and_the_newest_stay(kernels, tmp_path):
     assert {path.name for path in base.iterdir()} == {name, *(f"old{age}" for age in range(5))}
 
 
+def test_a_version_that_another_process_has_removed_is_not_missed(kernels, tmp_path):
+    """It was listed, and is gone before it is asked how old it is."""
+    results(kernels)
+    (file,) = (tmp_path / "cache").rglob("*four_times*.nbi")
+    gone = file.with_name(f"{file.stem.rpartition('-')[0]}-gone.nbi")
+    gone.symlink_to(tmp_path / "nowhere")
+    file.unlink()
+    assert results(kernels)[:2] == (4.0, True)
+    assert results(kernels)[:2] == (4.0, False)
+
+
 def test_the_folder_is_another_where_kernels_are_compiled_otherwise(kernels):
     _, _, first = results(kernels)
     with (kernels / "jit" / "disk.py").open("a") as file:

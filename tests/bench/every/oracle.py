@@ -148,7 +148,7 @@ class _Problem:
 
     def moved(self, x: dict[str, F64], delta: F64) -> dict[str, F64]:
         """x ⊞ δ."""
-        found = {}
+        found, delta = {}, np.append(delta, np.zeros(max(_TANGENT.values())))  # behind it: of what is fixed
         for kind, table in x.items():
             starts = self._starts[kind]
             own = np.where(starts[:, None] >= 0, delta[starts[:, None] + np.arange(_TANGENT[kind])], 0.0)

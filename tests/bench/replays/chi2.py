@@ -66,6 +66,11 @@ def _bearing_range_se2(a: F64, b: F64, z: F64) -> F64:
     return np.stack((wrap(np.arctan2(u[:, 1], u[:, 0]) - z[:, 0]), np.hypot(u[:, 0], u[:, 1]) - z[:, 1]), axis=1)
 
 
+def _bearing_se2(a: F64, b: F64, z: F64) -> F64:
+    u = into_frame_2d(a, b)
+    return wrap(np.arctan2(u[:, 1], u[:, 0])[:, None] - z)
+
+
 def _between_se3(a: F64, b: F64, z: F64) -> F64:
     t = into_frame_3d(z, into_frame_3d(a, b[:, :3]))
     q = _times(_conjugate(z[:, 3:]), _times(_conjugate(a[:, 3:]), b[:, 3:]))
@@ -140,6 +145,7 @@ RESIDUALS: dict[str, Callable[[F64, F64, F64], F64]] = {
     "landmark_se2": _landmark_se2,
     "landmark_se3": _landmark_se3,
     "bearing_range_se2": _bearing_range_se2,
+    "bearing_se2": _bearing_se2,
     "prior_se2": _prior_se2,
     "prior_se3": _prior_se3,
     "position_se2": _position_se2,

@@ -81,6 +81,20 @@ def _bearing_range_se2(i: int, j: int, z: F64, information: F64) -> Any:
     return gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(float(z[0])), float(z[1]), noise)
 
 
+def _bearing_se2(i: int, j: int, z: F64, information: F64) -> Any:
+    noise = gtsam.noiseModel.Gaussian.Information(information)
+    return gtsam.BearingFactor2D(i, j, gtsam.Rot2(float(z[0])), noise)
+
+
+def _landmark_se3(i: int, j: int, z: F64, information: F64) -> Any:
+    """As bearing and range with the covariance carried over: the wheel has no factor for a point from a pose."""
+    distance, bearing = float(np.linalg.norm(z)), gtsam.Unit3(z)
+    jacobian = np.vstack((bearing.basis().T / distance, z[None] / distance))
+    covariance = jacobian @ np.linalg.inv(information) @ jacobian.T
+    noise = gtsam.noiseModel.Gaussian.Covariance((covariance + covariance.T) / 2)
+    return gtsam.BearingRangeFactor3D(i, j, bearing, distance, noise)
+
+
 def _range(make: Callable[..., Any]) -> Callable[..., Any]:
     """A distance, as GTSAM's factor for the kinds of its ends."""
 
@@ -139,7 +153,9 @@ _FACTORS: dict[str, Callable[..., Any]] = {
     "between_se2": _between_se2,
     "between_se3": _between_se3,
     "landmark_se2": _landmark_se2,
+    "landmark_se3": _landmark_se3,
     "bearing_range_se2": _bearing_range_se2,
+    "bearing_se2": _bearing_se2,
     "range_se2": _range(gtsam.RangeFactor2D),
     "range_se3": _range(gtsam.RangeFactor3D),
     "range_between_se2": _range(gtsam.RangeFactorPose2),

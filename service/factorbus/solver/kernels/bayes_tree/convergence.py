@@ -9,7 +9,7 @@ from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_e
 from factorbus.solver.kernels.bayes_tree.own_error import is_own_pose
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
-from factorbus.solver.kernels.bayes_tree.work import SCANNING, note_work
+from factorbus.solver.kernels.bayes_tree.work import RELINEARIZING, SCANNING, SOLVING, note_work
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
@@ -63,11 +63,12 @@ def is_slow(fell: float, fell_before: float, state: I64, totals: F64) -> bool:
 @part
 def check_decrement(slow: bool, graph: Graph, tree: Tree, settings: F64) -> None:
     """Compute the decrement where Σ error² is as small as is allowed: where factors whose error is computed, not
-    bounded, have a part in it that has changed; or it is `slow`.
+    bounded, have a part in it that has changed; or it is `slow`, where a budget has room for that.
     """
     state, totals = tree.state, tree.totals
     error, share = totals[tl.T_ERROR], settings[tl.P_CONVERGED] * (totals[tl.T_CHI2] + LEAST_CHI2)
-    least = UNCHECKED * share
+    least, whole = UNCHECKED * share, fits_whole(settings, state, totals)
+    slow = slow and whole
     is_nothing = state[tl.S_EXACT] == 0 or error <= least
     if state[tl.S_CONTINUES] != 0 or error > allowed(settings, state, totals) or (is_nothing and not slow):
         totals[tl.T_EXCESS] = 0.0
@@ -75,8 +76,16 @@ def check_decrement(slow: bool, graph: Graph, tree: Tree, settings: F64) -> None
         totals[tl.T_UNCHECKED], totals[tl.T_CHECKED], totals[tl.T_EXCESS] = 0.0, error, 0.0
         if slow or computed_error(graph, tree) > least:
             most = slowly_left(settings, state) * (totals[tl.T_CHI2] + LEAST_CHI2)
-            found = decrement(least_of_sum(settings, state, totals), most, graph, tree)
+            of_one = least_of_sum(settings, state, totals) if whole else least_error(settings, state, totals)
+            found = decrement(of_one, whole, most, graph, tree)
             totals[tl.T_EXCESS] = found - error if found > most else 0.0
+
+
+@inline_kernel
+def fits_whole(settings: F64, state: I64, totals: F64) -> bool:
+    """Whether a budget has room for the gradient of all factors, and to try a step."""
+    work = (SCANNING + 2.0 * RELINEARIZING) * state[tl.S_FACTORS] + SOLVING * state[tl.S_VARIABLES]
+    return totals[tl.T_WORK] + work <= settings[tl.P_BUDGET]
 
 
 @inline_kernel

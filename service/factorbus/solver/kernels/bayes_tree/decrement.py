@@ -37,11 +37,11 @@ DIRECTIONS = 6  # at most: on old R the first are along what R, and not Λ, hard
 
 
 @part
-def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
-    """|R⁻ᵀ g|² with g the gradient that the linear models of factors miss, of error² above `least` or absolute; where
-    that is more than `most`, what χ² loses by the best step in up to `DIRECTIONS` directions, by the Jacobians at the
-    estimate, or in as many as come to more than `most`.  Where that is within `most` and not little: what steps like
-    it take off one after the other.
+def decrement(least: float, whole: bool, most: float, graph: Graph, tree: Tree) -> float:
+    """|R⁻ᵀ g|² with g the gradient that the linear models of factors miss, of error² above `least`, and, with `whole`,
+    of those that are absolute; where that is more than `most`, what χ² loses by the best step in up to `DIRECTIONS`
+    directions, by the Jacobians at the estimate, or in as many as come to more than `most`.  Where that is within
+    `most` and not little, with `whole`: what steps like it take off one after the other.
     """
     var, fac, node, clique, state = graph.var, graph.fac, tree.node, tree.clique, tree.state
     g = np.zeros(graph.counts[at.SCALARS])
@@ -49,7 +49,7 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
     state[tl.S_STAMP] += 1
     # 1
     for f in range(state[tl.S_FACTORS]):
-        if has_part(f, least, graph, tree):
+        if has_part(f, least, whole, graph, tree):
             taken += 1
             add_difference(graph, tree, f, scratch, tree.scalars[0], True, g)
             for n in range(count_ends(f, fac)):
@@ -65,7 +65,7 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
     z = g.copy()
     square = solve_forwards(graph, tree, cliques, z)
     if square <= most:
-        if square <= TRIED * most:
+        if square <= TRIED * most or not whole:
             return square
         solve_backwards(graph, tree, cliques, z)
         return left_along(z, square, graph, tree)
@@ -79,7 +79,7 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
             p[s] = z[s] + factor * p[s]
             Mp[s] = g[s] + factor * Mp[s]
         for f in range(state[tl.S_FACTORS]):
-            if has_part(f, least, graph, tree):
+            if has_part(f, least, whole, graph, tree):
                 add_difference(graph, tree, f, scratch, p, False, Ap)
         note_work(work, tree.totals)
         curvature = 0.0
@@ -97,19 +97,19 @@ def decrement(least: float, most: float, graph: Graph, tree: Tree) -> float:
             z[s] = g[s]
         before, square = square, solve_forwards(graph, tree, cliques, z)
         factor = square / before
-    return left_along(step, found, graph, tree) if found > TRIED * most else found
+    return left_along(step, found, graph, tree) if found > TRIED * most and whole else found
 
 
 @inline_kernel
-def has_part(f: int, least: float, graph: Graph, tree: Tree) -> bool:
-    """Whether the gradient of factor f is another one than that of its linear model: error² of more than `least`, or
-    the map has turned against what is fixed, and so does the force of what is exactly linear."""
+def has_part(f: int, least: float, whole: bool, graph: Graph, tree: Tree) -> bool:
+    """Whether the gradient of factor f is another one than that of its linear model: error² of more than `least`, or,
+    with `whole`, the map may have turned against what is fixed, and the force of what is exactly linear with it."""
     if is_member(f, graph.fac):
         return False
     i, j = graph.fac[f, at.F_I], graph.fac[f, at.F_J]
-    if tree.factor_errors[f, tl.E_ERROR] > least or j < 0:
-        return True
-    return graph.var[i, at.V_SCALAR] < 0 or graph.var[j, at.V_SCALAR] < 0
+    if tree.factor_errors[f, tl.E_ERROR] > least or not whole:
+        return tree.factor_errors[f, tl.E_ERROR] > least
+    return j < 0 or graph.var[i, at.V_SCALAR] < 0 or graph.var[j, at.V_SCALAR] < 0
 
 
 @part

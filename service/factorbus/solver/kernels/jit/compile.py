@@ -58,7 +58,7 @@ from factorbus.ownership import make_private
 
 # From beside this file: a copy of them elsewhere is one by itself.
 from . import releases
-from .disk import cache_in
+from .disk import cache_in, used_at
 from .frame_room import call_with_room
 from .shared import SharedKernel, only_compile
 from .stamps import stamp_of
@@ -343,7 +343,7 @@ def _temporary(base: Path, problem: OSError) -> Path:
 def _prune(base: Path, keep: Path) -> None:
     """Remove all but the folders used last.  A process that still runs from one of them has its code in memory."""
     folders = [path for path in base.iterdir() if path.is_dir() and path != keep]
-    folders.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+    folders.sort(key=used_at, reverse=True)
     for path in folders[_KEPT_FOLDERS - 1 :]:
         shutil.rmtree(path, ignore_errors=True)
 

@@ -6,6 +6,7 @@ A file has the stamp of its kernel in its name (`stamps`).  Of each kernel the l
 import contextlib
 import glob
 import hashlib
+import math
 import os
 import pickle
 import secrets
@@ -67,6 +68,14 @@ def cache_in(folder: Callable[[], Path]) -> Callable[[Callable[..., Any], Callab
     return Cache
 
 
+def used_at(path: Path) -> float:
+    """When a file or folder was last used; long ago if another process has removed it meanwhile."""
+    try:
+        return path.stat().st_mtime
+    except FileNotFoundError:
+        return -math.inf
+
+
 class _OwnFiles(caching.IndexDataCacheFile):
     """The files of one function: written for this user alone, and read only if nobody else can have written them.
 
@@ -81,8 +90,8 @@ class _OwnFiles(caching.IndexDataCacheFile):
     def _drop_others(self) -> None:
         """All but the versions of this function that were used last."""
         name, _, _ = self._index_name.rpartition("-")
-        versions = [(path.stat().st_mtime, path) for path in Path(self._cache_path).glob(f"{glob.escape(name)}-*.nbi")]
-        for _, path in sorted(versions)[:-_KEPT]:
+        versions = Path(self._cache_path).glob(f"{glob.escape(name)}-*.nbi")
+        for path in sorted(versions, key=used_at)[:-_KEPT]:
             for one in (path, *path.parent.glob(f"{glob.escape(path.stem)}.*.nbc")):
                 one.unlink(missing_ok=True)
 
