@@ -48,7 +48,7 @@ def reported(report: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_room_makes_no_difference(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("factorbus.solver.graph.factor_graph.roomy", lambda need, _size: need)
+    monkeypatch.setattr("factorbus.solver.graph.factor_ids.roomy", lambda need, _size: need)
     monkeypatch.setattr("factorbus.solver.bayes_tree.tree.roomy", lambda need, _size: need)
     grown, make_room = list[int](), CliqueTree.make_room
     monkeypatch.setattr(CliqueTree, "make_room", lambda tree: (grown.append(1), make_room(tree))[1])
