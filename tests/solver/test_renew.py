@@ -124,7 +124,7 @@ def numbers_of(solver: Solver) -> list[tuple[list[int], bytes]]:
 
 def test_little_room_makes_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     wide = Solver(Options.of(**OFTEN))
-    for where in ("graph.factor_graph", "bayes_tree.tree"):
+    for where in ("graph.factor_ids", "bayes_tree.tree"):
         monkeypatch.setattr(f"factorbus.solver.{where}.roomy", lambda need, _size: need)
     grown, make_room = list[int](), CliqueTree.make_room
     tight = Solver(Options.of(**OFTEN))
