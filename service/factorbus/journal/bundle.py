@@ -10,7 +10,7 @@ from pathlib import Path
 
 from factorbus.journal.checkpoints import file_of
 from factorbus.journal.connecting import APPLICATION
-from factorbus.journal.folders import IMPORTING, is_map, make_beside, maps_in, sync_folder
+from factorbus.journal.folders import IMPORTING, is_map, make_beside, maps_in, own_place_of, sync_folder
 from factorbus.journal.problems import BadFile, JournalDamaged, JournalVersion, MapThere, NoJournal, NotWritten
 from factorbus.journal.store import NAME, Store, open_store, what_reading_failed_with
 from factorbus.ownership import private_file
@@ -27,7 +27,7 @@ def export_map(folder: Path, file: Path) -> int:
     Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable, NotWritten.
     """
     _refuse_in_journal(file)
-    beside = file.with_name(f".{file.name}.part")
+    beside = own_place_of(file, ".", ".part")
     store = _open_one_of(folder)
     try:
         beside.unlink(missing_ok=True)
@@ -63,8 +63,7 @@ def import_map(file: Path, folder: Path) -> None:
     if folder.exists():
         raise MapThere(folder)
     _check_exported(file)
-    beside = folder.with_name(f"{IMPORTING}{folder.name}")
-    shutil.rmtree(beside, ignore_errors=True)
+    beside = own_place_of(folder, IMPORTING)
     try:
         make_beside(beside)
         with file.open("rb") as source, open(beside / NAME, "xb", opener=private_file) as target:
@@ -84,6 +83,8 @@ def import_map(file: Path, folder: Path) -> None:
             raise BadFile(file, f"is damaged: {error}") from None
         raise NotWritten(folder, str(error)) from None
     except OSError as error:
+        if folder.exists():  # another process was faster
+            raise MapThere(folder) from None
         raise NotWritten(folder, str(error)) from None
     finally:
         shutil.rmtree(beside, ignore_errors=True)

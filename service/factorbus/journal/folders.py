@@ -1,7 +1,10 @@
 """Names of maps as folders, and how a new name is made to last."""
 
+import contextlib
+import glob
 import os
 import re
+import shutil
 from collections.abc import Container
 from pathlib import Path
 
@@ -60,6 +63,36 @@ def make_beside(folder: Path) -> None:
     """Make the folder of a map that is on its way, for this user alone.  Raises UnsafeJournal, OSError."""
     make_own(folder.parent)
     folder.mkdir(mode=0o700)
+
+
+def own_place_of(path: Path, before: str, behind: str = "") -> Path:
+    """Where this process makes what is to be `path`: beside it, under a name that no other process takes.
+
+    What processes that are gone have left there under such names is removed.
+    """
+    for left in path.parent.glob(f"{glob.escape(before + path.name)}.*{behind}"):
+        number = left.name[len(before + path.name) + 1 : len(left.name) - len(behind)]
+        if number.isdecimal() and (int(number) == os.getpid() or not _is_alive(int(number))):
+            _remove(left)
+    return path.with_name(f"{before}{path.name}.{os.getpid()}{behind}")
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+        return
+    with contextlib.suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
